@@ -1,0 +1,105 @@
+//! The projector seam.
+
+use std::{sync::Arc, time::Duration};
+
+use serde::{Deserialize, Serialize};
+
+use crate::{camera::Listing, clock::Timestamp, error::DeviceError};
+
+/// Code values of one pixel: red, green, blue.
+pub type Rgb = [u8; 3];
+
+/// One picture of the projector's native size, in its most compact form.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Slide {
+    /// One value everywhere.
+    Uniform(Rgb),
+    /// One value per column.
+    Columns(Arc<[Rgb]>),
+    /// One value per row.
+    Rows(Arc<[Rgb]>),
+    /// Row-major values of all pixels.
+    Full(Arc<[Rgb]>),
+}
+
+/// How the time of a receipt is known.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum ReceiptMethod {
+    /// By the simulated rig, which is its own truth.
+    Simulated,
+    /// By the X server's Present extension.
+    X11Present,
+    /// By Wayland presentation feedback.
+    WaylandPresentation,
+    /// Not known: the call returned, no more.
+    Guessed,
+    /// Read from a recording.
+    Recorded,
+}
+
+/// Evidence of what was sent to the glass and when.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct PresentReceipt {
+    /// Index of the slide in the loaded set, `None` for black.
+    pub slide: Option<u32>,
+    /// When the picture was flipped to scan-out, on the rig's clock. Light follows after the projector's latency.
+    pub flipped: Timestamp,
+    /// Number of the refresh at which it was flipped, where it is known.
+    pub refresh: Option<u64>,
+    /// How the above is known.
+    pub method: ReceiptMethod,
+}
+
+/// Who a projector is and how it behaves in time.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ProjectorInfo {
+    /// Driver that opened it.
+    pub driver: String,
+    /// Maker and model.
+    pub model: String,
+    /// Serial number, or what identifies it among its kind.
+    pub serial: String,
+    /// Native columns.
+    pub width: u32,
+    /// Native rows.
+    pub height: u32,
+    /// Time between refreshes.
+    pub refresh_period: Duration,
+    /// From flip to first light, and until the picture has settled, where it has been measured or is known.
+    pub timing: Option<ProjectorTiming>,
+}
+
+/// Measured delays of a projector.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct ProjectorTiming {
+    /// From flip to first light.
+    pub latency: Duration,
+    /// From first light until the residue of the previous picture is below 0.1 % of full scale.
+    pub settling: Duration,
+}
+
+/// A projector, driven from one thread.
+pub trait Projector: Send {
+    /// Identity, native size and timing.
+    fn info(&self) -> &ProjectorInfo;
+
+    /// Replaces the set of slides. Refuses slides that are not of the native size.
+    fn load(&mut self, slides: &[Slide]) -> Result<(), DeviceError>;
+
+    /// Shows slide `index` of the loaded set from the next refresh on. Returns when the flip is done or certain, with
+    /// its receipt; waits at most a few refreshes.
+    fn show(&mut self, index: u32) -> Result<PresentReceipt, DeviceError>;
+
+    /// Shows black. Works with nothing loaded, and after errors: it is what a cancelled scan leaves behind.
+    fn black(&mut self) -> Result<PresentReceipt, DeviceError>;
+}
+
+/// Finds and opens projectors of one family.
+pub trait ProjectorDriver {
+    /// All projectors of the family, usable or not.
+    fn list(&self) -> Result<Vec<Listing>, DeviceError>;
+
+    /// Opens the projector with `serial`, or the only one there is.
+    fn open(&self, serial: Option<&str>) -> Result<Box<dyn Projector>, DeviceError>;
+}

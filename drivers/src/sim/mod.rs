@@ -1,0 +1,1 @@
+//! The simulated rig: a physically true twin of a scanner.

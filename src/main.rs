@@ -1,0 +1,3 @@
+//! Entry point of the `polscan` program.
+
+fn main() {}
