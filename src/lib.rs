@@ -5,3 +5,5 @@ pub mod cloud;
 pub mod decode;
 pub mod geometry;
 pub mod grid;
+pub mod sequencer;
+pub mod truth;

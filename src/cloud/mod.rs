@@ -1,6 +1,6 @@
 //! From projector coordinates to points.
 
-use crate::grid::Grid;
+use crate::{decode::Class, grid::Grid};
 
 /// What limits a point besides noise; bits of the PLY property `flags`.
 pub mod flag {
@@ -27,4 +27,30 @@ pub struct Cloud {
     pub sigma_z_mm: Grid<f32>,
     /// Bits of [`flag`].
     pub flags: Grid<u8>,
+}
+
+/// How well rows agree with what columns and calibration predict.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct RowCheck {
+    /// Median of measured minus predicted row, in projector px.
+    pub median_px: f64,
+    /// 1.4826 times the median absolute deviation of the same, in projector px.
+    pub sigma_px: f64,
+    /// Gate that was applied, in projector px.
+    pub gate_px: f64,
+    /// Share of the otherwise valid pixels that the gate rejected.
+    pub rejected_share: f64,
+    /// How far the predicted row moves per column of error, in px/px (median): the power of the gate on columns.
+    pub rows_per_column: f64,
+}
+
+/// What a calibrated reconstruction makes of a decode.
+#[derive(Debug, Clone)]
+pub struct Reconstruction {
+    /// Points.
+    pub cloud: Cloud,
+    /// Class after the gates of volume and row as well.
+    pub class: Grid<Class>,
+    /// Agreement of rows, where rows were coded.
+    pub row_check: Option<RowCheck>,
 }
