@@ -4,9 +4,7 @@ use polscan_patterns::{Axis, Mode, Role};
 
 use super::{
     contrast::{Contrast, contrast},
-    gates,
-    noise,
-    pair_sum,
+    gates, noise, pair_sum,
     plan::{Frames, plan, reference_roles},
     sample::Sample,
     subpixel,
@@ -30,7 +28,8 @@ impl Accumulator {
     pub fn new(settings: DecodeSettings) -> Result<Self, DecodeError> {
         let refuse = |reason: String| Err(DecodeError::Settings { reason });
         let DecodeSettings { width, height, camera, thresholds, .. } = &settings;
-        if *width == 0 || *height == 0 || width.checked_mul(*height).is_none_or(|len| len > i32::MAX as usize) {
+        if *width == 0 || *height == 0 || width.checked_mul(*height).is_none_or(|len| len > i32::MAX as usize)
+        {
             return refuse(format!("{width}x{height} is no frame size"));
         }
         if !(1..=16).contains(&camera.bit_depth) {
@@ -45,11 +44,14 @@ impl Accumulator {
         if let Some(noise) = camera.noise {
             let usable = |value: f64| value.is_finite() && value >= 0.0;
             if !usable(noise.gain_dn_per_electron) || !usable(noise.read_noise_dn) {
-                return refuse("noise must be finite and not negative; leave it out to have it estimated".into());
+                return refuse(
+                    "noise must be finite and not negative; leave it out to have it estimated".into(),
+                );
             }
         }
         let usable = |value: f64| value.is_finite() && value > 0.0;
-        if !usable(thresholds.lit_sigma) || !usable(thresholds.soft_bit_sigma) || !usable(thresholds.snap_px) {
+        if !usable(thresholds.lit_sigma) || !usable(thresholds.soft_bit_sigma) || !usable(thresholds.snap_px)
+        {
             return refuse("thresholds must be finite and positive".into());
         }
         if thresholds.fit_edges < 2 {
@@ -125,7 +127,9 @@ impl Accumulator {
             found.into_iter().map(|(_, plane)| plane.plane()).collect()
         };
         let fast = self.settings.mode == Mode::Fast;
-        let code = of(&|role| matches!(role, Role::Code { axis, inverse: false, .. } if !(fast && axis == Axis::Row)));
+        let code = of(
+            &|role| matches!(role, Role::Code { axis, inverse: false, .. } if !(fast && axis == Axis::Row)),
+        );
         let dark = of(&|role| role == dark);
         let camera = self.settings.camera;
         contrast(&code, &dark, camera.bit_depth, camera.black_level_dn.unwrap_or(0.0), lit)
@@ -139,7 +143,10 @@ impl std::fmt::Debug for Accumulator {
     }
 }
 
-fn decode<T: Sample>(settings: &DecodeSettings, pushed: &[(Role, SharedPlane)]) -> Result<Decoded, DecodeError> {
+fn decode<T: Sample>(
+    settings: &DecodeSettings,
+    pushed: &[(Role, SharedPlane)],
+) -> Result<Decoded, DecodeError> {
     let mut frames = plan::<T>(settings, pushed)?;
     let camera = settings.camera;
     let black_level_dn = camera.black_level_dn.unwrap_or(0.0);
@@ -165,12 +172,23 @@ fn decode<T: Sample>(settings: &DecodeSettings, pushed: &[(Role, SharedPlane)]) 
     let mut interpolated = vec![false; maps.class.len()];
     let mut axis_maps = Vec::new();
     for (index, shape) in shapes.iter().enumerate() {
-        axis_maps.push(subpixel::refine(&frames, &maps, &gates, &settings.thresholds, index, *shape, &mut interpolated));
+        axis_maps.push(subpixel::refine(
+            &frames,
+            &maps,
+            &gates,
+            &settings.thresholds,
+            index,
+            *shape,
+            &mut interpolated,
+        ));
     }
     let (width, height) = (settings.width, settings.height);
     let mut axis_maps = axis_maps.into_iter();
     let Some(column) = axis_maps.next() else {
-        return Err(DecodeError::Missing { mode: settings.mode, missing: "the frames of the columns".into() });
+        return Err(DecodeError::Missing {
+            mode: settings.mode,
+            missing: "the frames of the columns".into(),
+        });
     };
     Ok(Decoded {
         column,
@@ -198,7 +216,9 @@ fn drift<T: Sample>(frames: &Frames<'_, T>, maps: &PixelMaps) -> Option<f64> {
     let (first, last) = (planes.first()?, planes.last()?);
     let mut shares: Vec<f32> = (0..maps.class.len())
         .step_by(7)
-        .filter(|&at| maps.class[at].is_lit() && maps.class[at] != Class::Saturated && maps.modulation[at] != 0.0)
+        .filter(|&at| {
+            maps.class[at].is_lit() && maps.class[at] != Class::Saturated && maps.modulation[at] != 0.0
+        })
         .map(|at| (last[at].dn() - first[at].dn()) as f32 / maps.modulation[at].abs())
         .collect();
     if shares.is_empty() {

@@ -295,9 +295,9 @@ fn is_outvoted(class: &[Class], views: &[AxisView<'_>], x: usize, y: usize) -> b
             if other == at || !class[other].is_valid() {
                 continue;
             }
-            let agrees = views.iter().all(|view| {
-                view.values[at].abs_diff(view.values[other]) as i32 <= view.shape.step.max(2)
-            });
+            let agrees = views
+                .iter()
+                .all(|view| view.values[at].abs_diff(view.values[other]) as i32 <= view.shape.step.max(2));
             if agrees {
                 supporters += 1;
             } else {

@@ -22,3 +22,6 @@ pub use types::{
     AxisMap, CameraResponse, Class, DecodeError, DecodeSettings, Decoded, NoiseModel, PairResidual, Plane,
     PlaneSource, SharedPlane, Thresholds,
 };
+
+#[cfg(test)]
+mod tests;

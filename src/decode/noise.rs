@@ -66,7 +66,8 @@ impl Spread {
             .map(|bin| {
                 let counts = &self.counts[bin * width..][..width];
                 let total = self.totals[bin] as f64;
-                let spread = (quantile(counts, 0.841_344_7 * total) - quantile(counts, 0.158_655_3 * total)) / 2.0;
+                let spread =
+                    (quantile(counts, 0.841_344_7 * total) - quantile(counts, 0.158_655_3 * total)) / 2.0;
                 // Counts are spread evenly over their step, which adds the variance of that step.
                 let variance = (spread * spread - 1.0 / 12.0).max(0.0) * f64::from(self.step * self.step);
                 // Quantiles of N samples are about 1.9 times noisier than a standard deviation; 2 % is the floor
@@ -100,8 +101,11 @@ pub(crate) fn estimate<T: Sample>(
     let mut sources = Vec::new();
     for axis in &frames.axes {
         let coarse = axis.code.code.bits().div_ceil(2);
-        let pairs: Vec<_> =
-            frames.pairs().filter(|&(a, bit, ..)| a == axis.axis && bit < coarse).map(|(.., p, q)| [p, q]).collect();
+        let pairs: Vec<_> = frames
+            .pairs()
+            .filter(|&(a, bit, ..)| a == axis.axis && bit < coarse)
+            .map(|(.., p, q)| [p, q])
+            .collect();
         sources.extend(pairs.windows(2).map(|two| Source { first: two[0], second: two[1] }));
     }
     if sources.is_empty() {
@@ -139,7 +143,8 @@ fn from_sources<T: Sample>(
     let stride = (height / ROWS).max(1);
     for source in sources {
         for y in (stride / 2..height).step_by(stride) {
-            let row = |plane: &'_ [T]| -> Vec<i32> { plane[y * width..][..width].iter().map(|s| s.dn()).collect() };
+            let row =
+                |plane: &'_ [T]| -> Vec<i32> { plane[y * width..][..width].iter().map(|s| s.dn()).collect() };
             let planes = [source.first[0], source.first[1], source.second[0], source.second[1]].map(row);
             let sums = |x: usize| {
                 let values = [0, 1, 2, 3].map(|plane: usize| planes[plane][x]);
@@ -193,10 +198,7 @@ fn fit(points: &[(f64, f64, f64)]) -> Option<NoiseModel> {
             slope = ((wlv - offset * wl) / wll).max(0.0);
         }
     }
-    Some(NoiseModel {
-        gain_dn_per_electron: slope,
-        read_noise_dn: (offset - 1.0 / 12.0).max(0.0).sqrt(),
-    })
+    Some(NoiseModel { gain_dn_per_electron: slope, read_noise_dn: (offset - 1.0 / 12.0).max(0.0).sqrt() })
 }
 
 /// What is assumed where nothing can be measured: a full well of 10 000 electrons and a read noise of 1/1000 of it.

@@ -61,11 +61,17 @@ pub fn pair_residual(p: Plane<'_>, q: Plane<'_>, context: &PairContext<'_>) -> O
 /// Noise of the camera from two or more pairs of frames that sum to the same light (pattern and inverse of coarse
 /// bits; both references are such a pair too), each pair compared with the next. `None` where there is too little.
 pub fn estimate_noise(pairs: &[[Plane<'_>; 2]], width: usize, camera: &CameraResponse) -> Option<NoiseModel> {
-    fn typed<T: Sample>(pairs: &[[Plane<'_>; 2]], width: usize, camera: &CameraResponse) -> Option<NoiseModel> {
+    fn typed<T: Sample>(
+        pairs: &[[Plane<'_>; 2]],
+        width: usize,
+        camera: &CameraResponse,
+    ) -> Option<NoiseModel> {
         let len = pairs.first()?[0].len();
         let pairs: Vec<[&[T]; 2]> = pairs
             .iter()
-            .map(|pair| Some([T::of(pair[0])?, T::of(pair[1])?]).filter(|pair| pair.iter().all(|p| p.len() == len)))
+            .map(|pair| {
+                Some([T::of(pair[0])?, T::of(pair[1])?]).filter(|pair| pair.iter().all(|p| p.len() == len))
+            })
             .collect::<Option<_>>()?;
         noise::from_pairs(
             &pairs,
@@ -203,9 +209,15 @@ fn from_references<T: Sample>(high: &[&[T]], low: &[&[T]], at: usize, gates: &Ga
 
 fn typed_residual<T: Sample>(p: Plane<'_>, q: Plane<'_>, context: &PairContext<'_>) -> Option<PairResidual> {
     let (p, q) = (T::of(p)?, T::of(q)?);
-    let typed = |planes: &[Plane<'_>]| planes.iter().all(|plane| T::of(*plane).is_some_and(|s| s.len() == p.len()));
+    let typed =
+        |planes: &[Plane<'_>]| planes.iter().all(|plane| T::of(*plane).is_some_and(|s| s.len() == p.len()));
     let whole = context.width > 0 && p.len() == q.len() && p.len().is_multiple_of(context.width);
-    if !whole || context.high.is_empty() || context.low.is_empty() || !typed(context.high) || !typed(context.low) {
+    if !whole
+        || context.high.is_empty()
+        || context.low.is_empty()
+        || !typed(context.high)
+        || !typed(context.low)
+    {
         return None;
     }
     let high: Vec<&[T]> = context.high.iter().filter_map(|&plane| T::of(plane)).collect();
@@ -247,7 +259,11 @@ fn neighbours(x: usize, y: usize, width: usize, height: usize) -> impl Iterator<
 }
 
 /// Residuals of all pairs of a scan, in order of axis and bit.
-pub(crate) fn of_scan<T: Sample>(frames: &Frames<'_, T>, maps: &PixelMaps, gates: &Gates) -> Vec<PairResidual> {
+pub(crate) fn of_scan<T: Sample>(
+    frames: &Frames<'_, T>,
+    maps: &PixelMaps,
+    gates: &Gates,
+) -> Vec<PairResidual> {
     let (width, height) = (frames.width, frames.height);
     let pair_count = frames.pair_count();
     let rows: Vec<usize> = sampled_rows(height).collect();
@@ -275,8 +291,11 @@ pub(crate) fn of_scan<T: Sample>(frames: &Frames<'_, T>, maps: &PixelMaps, gates
                 };
                 let Some(expected) = expected else { return (0.0, 0.0, [0; 2]) };
                 let mut changed = [0u16; 2];
-                for (changed, words) in changed.iter_mut().zip(&maps.words).filter(|(_, words)| !words.is_empty()) {
-                    *changed = neighbours(x, y, width, height).fold(0, |sum, other| sum | (words[other] ^ words[at]));
+                for (changed, words) in
+                    changed.iter_mut().zip(&maps.words).filter(|(_, words)| !words.is_empty())
+                {
+                    *changed = neighbours(x, y, width, height)
+                        .fold(0, |sum, other| sum | (words[other] ^ words[at]));
                 }
                 (expected.sum, expected.per_sigma, changed)
             })

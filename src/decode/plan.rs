@@ -183,7 +183,10 @@ pub(crate) fn plan<'a, T: Sample>(
     tell_levels(mode, levels, &mut losses);
     let plan = Frames { width: settings.width, height: settings.height, high, low, levels, axes, losses };
     if levels != Levels::References && plan.pair_count() == 0 {
-        return Err(DecodeError::Missing { mode, missing: "references or pairs to tell lit pixels by".into() });
+        return Err(DecodeError::Missing {
+            mode,
+            missing: "references or pairs to tell lit pixels by".into(),
+        });
     }
     Ok(plan)
 }
@@ -214,7 +217,8 @@ fn tell_losses<T>(
     losses: &mut Vec<String>,
 ) {
     let list = |bits: Vec<usize>| bits.iter().map(usize::to_string).collect::<Vec<_>>().join(", ");
-    let single = (0..leading).filter(|&bit| matches!(found[bit], Some(BitFrames::Single(..)))).collect::<Vec<_>>();
+    let single =
+        (0..leading).filter(|&bit| matches!(found[bit], Some(BitFrames::Single(..)))).collect::<Vec<_>>();
     if !single.is_empty() {
         losses.push(format!(
             "{axis} bits {} have one frame of their pair only: decided against the middle of the references",

@@ -216,7 +216,13 @@ impl Scratch {
         }
     }
 
-    fn decode_row<T: Sample>(&mut self, frames: &Frames<'_, T>, gates: &Gates, y: usize, mut row: RowMaps<'_>) {
+    fn decode_row<T: Sample>(
+        &mut self,
+        frames: &Frames<'_, T>,
+        gates: &Gates,
+        y: usize,
+        mut row: RowMaps<'_>,
+    ) {
         let width = frames.width;
         let at = y * width..(y + 1) * width;
         self.saturated.fill(0);
@@ -291,8 +297,11 @@ impl Scratch {
                     (high, low, high - low, variance)
                 }
                 Levels::HighOnly | Levels::LowOnly => {
-                    let (high, low) =
-                        if frames.levels == Levels::HighOnly { (high, mean_sum - high) } else { (mean_sum - low, low) };
+                    let (high, low) = if frames.levels == Levels::HighOnly {
+                        (high, mean_sum - high)
+                    } else {
+                        (mean_sum - low, low)
+                    };
                     let (known, count) =
                         if frames.levels == Levels::HighOnly { (high, high_count) } else { (low, low_count) };
                     // C = +-(2 R - mean sum): the known reference counts twice.
@@ -448,7 +457,10 @@ impl Scratch {
                 }
             }
             let sigma = row.sigma[x];
-            if class.is_valid() && weak[x].is_finite() && self.saturated[x] == 0 && modulation >= WEAK_JUDGED * sigma
+            if class.is_valid()
+                && weak[x].is_finite()
+                && self.saturated[x] == 0
+                && modulation >= WEAK_JUDGED * sigma
             {
                 row.weakest[x] = (weak[x] / modulation * WEAK_SCALE).min(254.0) as u8;
             }
