@@ -107,3 +107,84 @@ fn bow(local: &[[f64; 3]]) -> f64 {
     let (low, high) = heights.fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), v| (l.min(v), h.max(v)));
     if (high - low).is_finite() { high - low } else { 0.0 }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A grid of points on z = f(x, y) over [-r, r]^2 that `keep` keeps.
+    fn points(r: f64, f: impl Fn(f64, f64) -> f64, keep: impl Fn(f64, f64) -> bool) -> Vec<[f64; 3]> {
+        let at = |k: i32| r * f64::from(k) / 50.0;
+        let grid = (-50..=50).flat_map(|i| (-50..=50).map(move |j| (at(i), at(j))));
+        grid.filter(|&(x, y)| keep(x, y)).map(|(x, y)| [x, y, f(x, y)]).collect()
+    }
+
+    #[test]
+    fn an_exact_plane_is_flat() {
+        let fit = fit_plane(&points(80.0, |x, y| 1000.0 + 0.2 * x - 0.1 * y, |_, _| true)).unwrap();
+        assert_eq!(fit.points, 101 * 101);
+        assert!(fit.rmse_mm < 1e-9 && fit.p95_mm < 1e-9 && fit.bow_mm < 1e-9, "{fit:?}");
+        let norm = (1.0_f64 + 0.04 + 0.01).sqrt();
+        let expected = [0.2 / norm, -0.1 / norm, -1.0 / norm];
+        for k in 0..3 {
+            assert!((fit.normal[k] - expected[k]).abs() < 1e-12, "{:?}", fit.normal);
+        }
+        assert!((fit.centroid_mm[2] - 1000.0).abs() < 1e-9);
+    }
+
+    /// Distances +1 and -1 in equal shares, uncorrelated with the position: rms 1, every quantile 1, no bow.
+    #[test]
+    fn rmse_is_the_distance_along_the_normal() {
+        let mut signs = [1.0, -1.0].into_iter().cycle();
+        let mut flat = points(50.0, |_, _| 0.0, |_, _| true);
+        flat.pop();
+        for point in &mut flat {
+            point[2] += signs.next().unwrap();
+        }
+        let fit = fit_plane(&flat).unwrap();
+        assert!((fit.rmse_mm - 1.0).abs() < 1e-3 && (fit.p95_mm - 1.0).abs() < 0.05, "{fit:?}");
+        assert!(fit.bow_mm < 0.01, "{fit:?}");
+        // Tilting the whole by 60 degrees changes no distance.
+        let turn = nalgebra::Rotation3::from_euler_angles(1.05, 0.3, -0.4);
+        let turned: Vec<[f64; 3]> = flat
+            .iter()
+            .map(|p| (turn * Vector3::from(*p) + Vector3::new(10.0, 20.0, 900.0)).into())
+            .collect();
+        let tilted = fit_plane(&turned).unwrap();
+        assert!((tilted.rmse_mm - fit.rmse_mm).abs() < 1e-9 && (tilted.bow_mm - fit.bow_mm).abs() < 1e-9);
+        let normal = turn * Vector3::z();
+        assert!(Vector3::from(tilted.normal).cross(&normal).norm() < 1e-3);
+        assert!(
+            Vector3::from(tilted.normal).dot(&Vector3::from(tilted.centroid_mm)) < 0.0,
+            "towards the camera"
+        );
+    }
+
+    #[test]
+    fn bow_of_a_sphere_cap_is_its_sagitta() {
+        let (big, r) = (20_000.0_f64, 60.0);
+        let cap = |x: f64, y: f64| 1000.0 + big - (big * big - x * x - y * y).sqrt();
+        let fit = fit_plane(&points(r, cap, |x, y| x.hypot(y) <= r)).unwrap();
+        let sagitta = r * r / (2.0 * big);
+        assert!((fit.bow_mm - sagitta).abs() < 1e-3 * sagitta, "{} against {sagitta}", fit.bow_mm);
+        // The mean square of a paraboloid about its mean over a disc is sagitta^2 / 12.
+        assert!((fit.rmse_mm - sagitta / 12.0_f64.sqrt()).abs() < 0.01 * sagitta, "{}", fit.rmse_mm);
+    }
+
+    #[test]
+    fn bow_sees_a_cylinder_on_a_long_strip() {
+        let fit = fit_plane(&points(100.0, |x, _| 900.0 + 1e-4 * x * x, |_, y| y.abs() < 5.0)).unwrap();
+        assert!((fit.bow_mm - 1.0).abs() < 1e-6, "{}", fit.bow_mm);
+    }
+
+    #[test]
+    fn refuses_what_is_no_plane() {
+        assert_eq!(fit_plane(&[[0.0; 3]; 5]), Err(PlaneError::TooFew(5)));
+        assert_eq!(fit_plane(&[[1.0, 2.0, 3.0]; 50]), Err(PlaneError::Degenerate));
+        let line: Vec<[f64; 3]> = (0..50).map(|i| [f64::from(i), 2.0 * f64::from(i), 5.0]).collect();
+        assert_eq!(fit_plane(&line), Err(PlaneError::Degenerate));
+        let mut holes = points(10.0, |x, _| x, |_, _| true);
+        holes[7][1] = f64::NAN;
+        assert_eq!(fit_plane(&holes), Err(PlaneError::Degenerate));
+    }
+}

@@ -145,3 +145,97 @@ fn vertex(bytes: &[u8]) -> PlyPoint {
         flags: bytes[29],
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn cloud() -> (Cloud, Grid<u8>) {
+        let nan = f32::NAN;
+        let points =
+            vec![[nan; 3], [1.0, 2.0, 3.0], [4.5, -5.25, 1000.125], [nan; 3], [7.0, 8.0, 9.0], [nan; 3]];
+        let normals = vec![[0.0; 3], [0.0, 0.0, -1.0], [0.0; 3], [0.0; 3], [0.6, 0.0, -0.8], [0.0; 3]];
+        let cloud = Cloud {
+            point_mm: Grid::from_vec(3, 2, points),
+            normal: Grid::from_vec(3, 2, normals),
+            sigma_z_mm: Grid::from_vec(3, 2, vec![nan, 0.5, 0.25, nan, 0.125, nan]),
+            flags: Grid::from_vec(3, 2, vec![0, 1, 16, 0, 31, 0]),
+        };
+        (cloud, Grid::from_vec(3, 2, vec![0, 10, 200, 0, 255, 0]))
+    }
+
+    #[test]
+    fn writes_valid_points_in_row_major_order() {
+        let (cloud, intensity) = cloud();
+        let mut bytes = Vec::new();
+        assert_eq!(write_ply(&mut bytes, &cloud, &intensity, CloudFrame::Camera).unwrap(), 3);
+        let read = read_ply(&bytes).unwrap();
+        let expected = [(1, 0.5, 10, 1), (2, 0.25, 200, 16), (4, 0.125, 255, 31)];
+        assert_eq!(read.len(), expected.len());
+        for (point, (at, sigma_z_mm, intensity, flags)) in read.into_iter().zip(expected) {
+            let (point_mm, normal) = (cloud.point_mm.data()[at], cloud.normal.data()[at]);
+            assert_eq!(point, PlyPoint { point_mm, normal, intensity, sigma_z_mm, flags });
+        }
+    }
+
+    #[test]
+    fn the_header_is_the_public_one() {
+        let text = header(7, CloudFrame::World);
+        let properties: Vec<&str> = text.lines().filter_map(|l| l.strip_prefix("property ")).collect();
+        assert_eq!(
+            properties,
+            [
+                "float x",
+                "float y",
+                "float z",
+                "float nx",
+                "float ny",
+                "float nz",
+                "uchar intensity",
+                "float sigma_z",
+                "uchar flags"
+            ]
+        );
+        assert!(text.starts_with("ply\nformat binary_little_endian 1.0\ncomment "));
+        assert!(text.contains("comment units mm\n") && text.contains("comment frame world"));
+        assert!(text.contains("element vertex 7\n") && text.ends_with("end_header\n"));
+    }
+
+    #[test]
+    fn an_empty_cloud_is_a_file() {
+        let (mut cloud, intensity) = cloud();
+        cloud.point_mm = Grid::filled(3, 2, [f32::NAN; 3]);
+        let mut bytes = Vec::new();
+        assert_eq!(write_ply(&mut bytes, &cloud, &intensity, CloudFrame::Camera).unwrap(), 0);
+        assert_eq!(read_ply(&bytes).unwrap(), []);
+    }
+
+    #[test]
+    fn the_reader_refuses_other_files() {
+        let (cloud, intensity) = cloud();
+        let mut bytes = Vec::new();
+        write_ply(&mut bytes, &cloud, &intensity, CloudFrame::Camera).unwrap();
+        for cut in 0..bytes.len() {
+            assert!(read_ply(&bytes[..cut]).is_err(), "{cut}");
+        }
+        assert!(
+            read_ply(b"ply\nformat ascii 1.0\nelement vertex 99999999999999999999\nend_header\n").is_err()
+        );
+    }
+
+    #[test]
+    fn errors_of_the_target_are_passed_on() {
+        struct Full;
+        impl Write for Full {
+            fn write(&mut self, _: &[u8]) -> io::Result<usize> {
+                Err(io::Error::from(io::ErrorKind::StorageFull))
+            }
+            fn flush(&mut self) -> io::Result<()> {
+                Ok(())
+            }
+        }
+        let (cloud, intensity) = cloud();
+        let error = write_ply(Full, &cloud, &intensity, CloudFrame::Camera).unwrap_err();
+        assert_eq!(error.kind(), io::ErrorKind::StorageFull);
+    }
+}

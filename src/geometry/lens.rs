@@ -245,3 +245,180 @@ impl Lens {
         false
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn narrow() -> Lens {
+        Lens {
+            width: 1600,
+            height: 1200,
+            fx: 4638.0,
+            fy: 4641.0,
+            cx: 812.5,
+            cy: 587.25,
+            distortion: [-0.11, 0.15, 4e-4, -3e-4, 0.02],
+        }
+    }
+
+    /// The published result of the toolbox's own example (20 views, 640x480).
+    fn wide() -> Lens {
+        Lens {
+            width: 640,
+            height: 480,
+            fx: 657.3955332440277,
+            fy: 657.7633541058974,
+            cx: 302.98216518636815,
+            cy: 242.61782605413717,
+            distortion: [
+                -0.25583927889009855,
+                0.1275762918499085,
+                -0.00020819047988286177,
+                3.3307713495661755e-05,
+                0.0,
+            ],
+        }
+    }
+
+    fn close(a: [f64; 2], b: [f64; 2], tolerance: f64) {
+        assert!((a[0] - b[0]).abs() <= tolerance && (a[1] - b[1]).abs() <= tolerance, "{a:?} against {b:?}");
+    }
+
+    /// Constants of opencv-python-headless 5.0.0:
+    /// `cv2.projectPoints(P, 0, 0, K, d)`.
+    #[test]
+    fn projects_like_opencv() {
+        let cases = [
+            ([10.0, 20.0, 1000.0], [858.877218939366, 680.066754780982]),
+            ([-150.0, -110.0, 965.0], [94.3106527203854, 60.344055919847165]),
+            ([160.0, 120.0, 1010.0], [1544.1793307793148, 1136.478191330827]),
+            ([-3.25, 55.5, 870.0], [795.1752722638104, 883.2048998281971]),
+        ];
+        for (point, pixel) in cases {
+            close(narrow().project(&Vector3::from(point)).unwrap(), pixel, 1e-9);
+        }
+        let cases = [
+            ([-0.4, -0.3, 1.0], [54.72564337259348, 56.28291488940121]),
+            ([0.5, 0.35, 1.0], [606.1448042429613, 454.89368680234463]),
+        ];
+        for (point, pixel) in cases {
+            close(wide().project(&Vector3::from(point)).unwrap(), pixel, 1e-9);
+        }
+    }
+
+    /// `cv2.undistortPoints(px, K, d, criteria=(COUNT | EPS, 200, 1e-15))` of the same version.
+    #[test]
+    fn undistorts_like_opencv() {
+        let cases = [
+            (narrow(), [0.0, 0.0], [-0.17602241792046205, -0.12717057116684805]),
+            (narrow(), [1599.0, 1199.0], [0.17040802443204375, 0.13243027990593376]),
+            (narrow(), [300.5, 1000.25], [-0.1106099318725802, 0.08916159116068907]),
+            (wide(), [0.0, 0.0], [-0.5032282542552865, -0.40263624855984376]),
+            (wide(), [639.0, 479.0], [0.5633957779516999, 0.39623773039815174]),
+        ];
+        for (lens, pixel, expected) in cases {
+            let ray = lens.ray(pixel).unwrap();
+            close([ray.x, ray.y], expected, 1e-10);
+        }
+    }
+
+    #[test]
+    fn the_jacobian_is_the_derivative() {
+        for lens in [narrow(), wide()] {
+            for (x, y) in [(0.1, -0.2), (-0.3, 0.25), (0.0, 0.0)] {
+                let (_, _, [xx, xy, yy]) = lens.distort_with_jacobian(x, y);
+                let h = 1e-6;
+                let by = |dx: f64, dy: f64| {
+                    let (a, b) = (lens.distort([x + dx, y + dy]), lens.distort([x - dx, y - dy]));
+                    [(a[0] - b[0]) / (2.0 * h), (a[1] - b[1]) / (2.0 * h)]
+                };
+                close(by(h, 0.0), [xx, xy], 1e-8);
+                close(by(0.0, h), [xy, yy], 1e-8);
+            }
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn undistort_undoes_distort(
+            k1 in -0.3..0.3f64, k2 in -0.2..0.2f64, p1 in -2e-3..2e-3f64, p2 in -2e-3..2e-3f64, k3 in -0.1..0.1f64,
+            u in -0.5..1599.5f64, v in -0.5..1199.5f64, focal in 1200.0..6000.0f64,
+        ) {
+            let lens = Lens { fx: focal, fy: focal * 1.01, distortion: [k1, k2, p1, p2, k3], ..narrow() };
+            prop_assume!(lens.faults("camera").is_empty());
+            let ray = lens.ray([u, v]).expect("a lens without faults inverts all over its image");
+            let back = lens.project(&(ray * 870.0)).unwrap();
+            prop_assert!((back[0] - u).abs() < 1e-7 && (back[1] - v).abs() < 1e-7, "{back:?} {u} {v}");
+            let [x, y] = lens.distort([ray.x, ray.y]);
+            let again = lens.undistort([x, y]).unwrap();
+            prop_assert!((again[0] - ray.x).abs() < 1e-10 && (again[1] - ray.y).abs() < 1e-10);
+        }
+
+        #[test]
+        fn no_numbers_panic(values in prop::array::uniform9(any::<f64>()), w in any::<u32>(), h in any::<u32>()) {
+            let [fx, fy, cx, cy, k1, k2, p1, p2, k3] = values;
+            let lens = Lens { width: w, height: h, fx, fy, cx, cy, distortion: [k1, k2, p1, p2, k3] };
+            let _ = lens.faults("camera");
+            let _ = lens.undistort([k1, p2]);
+        }
+    }
+
+    #[test]
+    fn usable_lenses_have_no_faults() {
+        assert_eq!(narrow().faults("camera"), Vec::<String>::new());
+        assert_eq!(wide().faults("camera"), Vec::<String>::new());
+        // A projector with its principal point below the image, and one with strong high-order distortion.
+        let projector = Lens {
+            width: 1024,
+            height: 768,
+            fx: 1942.5397,
+            fy: 1930.5588,
+            cx: 453.3146,
+            cy: 730.5029,
+            distortion: [-0.0969, 1.07258, -0.0018, -0.00867, -6.8213],
+        };
+        assert_eq!(projector.faults("projector"), Vec::<String>::new());
+    }
+
+    #[test]
+    fn every_fault_is_named() {
+        let named = |lens: Lens, words: &[&str]| {
+            let faults = lens.faults("camera").join("; ");
+            for word in words {
+                assert!(faults.contains(word), "{word:?} not in {faults:?}");
+            }
+        };
+        named(Lens { fx: f64::NAN, cy: f64::INFINITY, ..narrow() }, &["fx is NaN", "cy is inf"]);
+        named(Lens { fx: -4638.0, width: 0, ..narrow() }, &["width is 0"]);
+        named(Lens { fx: -4638.0, ..narrow() }, &["fx is -4638 px, expected a positive"]);
+        named(Lens { cx: 2500.0, cy: -700.0, ..narrow() }, &["cx is 2500.0 px", "cy is -700.0 px"]);
+        // A diverged fit of a telecentric view: everything is finite and smooth over the image, but absurd.
+        let diverged = Lens {
+            width: 512,
+            height: 150,
+            fx: 217_143.875712604,
+            fy: 168_591.855939185,
+            cx: 255.5,
+            cy: 74.5,
+            distortion: [418.88, -618_437.68, -1.8467, -1.485, 0.0],
+        };
+        named(diverged, &["fx is 217143.9 px", "fy is 168591.9 px", "diverged"]);
+        named(
+            Lens { distortion: [-2.5, 0.0, 0.0, 0.0, 0.0], fx: 1500.0, fy: 1500.0, ..narrow() },
+            &["k1 -2.5", "folds"],
+        );
+        named(
+            Lens { distortion: [0.0, 0.0, 0.9, 0.0, 0.0], fx: 900.0, fy: 900.0, ..narrow() },
+            &["p1 0.9", "inverted"],
+        );
+    }
+
+    #[test]
+    fn points_behind_are_not_projected() {
+        assert_eq!(narrow().project(&Vector3::new(1.0, 2.0, 0.0)), None);
+        assert_eq!(narrow().project(&Vector3::new(1.0, 2.0, -5.0)), None);
+    }
+}

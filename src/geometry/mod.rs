@@ -11,3 +11,6 @@ pub use file::{CalibrationError, MAX_BYTES, ReadHints};
 pub use lens::Lens;
 pub use rays::RayTable;
 pub use triangulate::{Measurement, Solution, TriangulateError, Triangulator};
+
+#[cfg(test)]
+pub(crate) mod fixtures;

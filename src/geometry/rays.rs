@@ -32,3 +32,22 @@ impl RayTable {
         &self.directions
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::fixtures::rig;
+
+    #[test]
+    fn each_ray_projects_back_to_its_pixel() {
+        let lens = rig(16.0).camera;
+        let table = RayTable::new(&lens);
+        for y in 0..lens.height as usize {
+            for x in 0..lens.width as usize {
+                let [dx, dy] = table.directions().at(x, y);
+                let [u, v] = lens.project(&nalgebra::Vector3::new(dx, dy, 1.0)).unwrap();
+                assert!((u - x as f64).abs() < 1e-9 && (v - y as f64).abs() < 1e-9);
+            }
+        }
+    }
+}

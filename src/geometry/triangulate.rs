@@ -15,6 +15,10 @@ const INTEGER_SIGMA: f64 = 0.288_675_134_594_812_9;
 /// Rows are weighed in when one column of error moves the predicted row by at least this much. Below it they add
 /// under 1 % of information and only bring the systematic error of the row calibration.
 const MIN_ROWS_PER_COLUMN: f64 = 0.1;
+/// No camera measures a projector coordinate better than this, in px.
+const MIN_SIGMA: f64 = 1e-6;
+/// Beyond a thousand kilometres a point is at infinity.
+const MIN_INVERSE_DEPTH: f64 = 1e-9;
 /// Newton steps; each roughly squares the error.
 const MAX_STEPS: usize = 12;
 
@@ -124,7 +128,7 @@ impl Triangulator {
     pub fn solve(&self, x: usize, y: usize, measured: &Measurement) -> Option<Solution> {
         let [dx, dy] = self.rays.directions().at(x, y);
         let q = self.rotation * Vector3::new(dx, dy, 1.0);
-        let sigma = |s: f64| if s.is_finite() && s > 0.0 { s } else { INTEGER_SIGMA };
+        let sigma = |s: f64| if s.is_finite() && s > 0.0 { s.max(MIN_SIGMA) } else { INTEGER_SIGMA };
         let sigmas = [sigma(measured.sigma_column), sigma(measured.sigma_row)];
         let pixel = [measured.column, measured.row];
         let gain = self.pinhole_gain(&q);
@@ -144,7 +148,7 @@ impl Triangulator {
         if both && self.rows_carry_depth() {
             (w, seen, information) = self.weigh(&q, pixel, sigmas, w, seen)?;
         }
-        if !(w > 0.0 && information > 0.0) || q.z + w * self.translation_mm.z <= 0.0 {
+        if !(w > MIN_INVERSE_DEPTH && information > 0.0) || q.z + w * self.translation_mm.z <= 0.0 {
             return None;
         }
         let z = 1.0 / w;
@@ -257,5 +261,171 @@ impl Triangulator {
         }
         slopes.sort_by(f64::total_cmp);
         slopes[slopes.len() / 2]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+    use crate::geometry::{
+        Projector,
+        fixtures::{looking_at, rig, two_axis_rig},
+    };
+
+    /// Projector pixel of a camera-frame point, by the slow way round.
+    fn truth(calibration: &Calibration, point: &Vector3<f64>) -> [f64; 2] {
+        let projector = calibration.projector.unwrap();
+        projector.lens.project(&projector.projector_from_camera.transform(point)).unwrap()
+    }
+
+    /// Depth at which the ray's projection crosses `column`, by bisection on [`Lens::project`] alone.
+    fn bisect(calibration: &Calibration, ray: Vector3<f64>, column: f64) -> f64 {
+        let miss = |z: f64| truth(calibration, &(ray * z))[0] - column;
+        let (mut near, mut far) = (300.0, 3000.0);
+        assert!(miss(near) * miss(far) < 0.0, "the column is crossed between the ends");
+        for _ in 0..200 {
+            let middle = 0.5 * (near + far);
+            if miss(near) * miss(middle) <= 0.0 { far = middle } else { near = middle }
+        }
+        0.5 * (near + far)
+    }
+
+    fn exact(pixel: [f64; 2]) -> Measurement {
+        Measurement { column: pixel[0], sigma_column: 0.05, row: f64::NAN, sigma_row: f64::NAN }
+    }
+
+    #[test]
+    fn agrees_with_bisection_on_the_full_model() {
+        for calibration in [rig(8.0), two_axis_rig(8.0)] {
+            let triangulator = Triangulator::new(&calibration).unwrap();
+            for (x, y) in [(0, 0), (199, 149), (100, 75), (30, 120), (170, 5)] {
+                let ray = calibration.camera.ray([x as f64, y as f64]).unwrap();
+                for column in
+                    [truth(&calibration, &(ray * 800.0))[0], truth(&calibration, &(ray * 1234.5))[0]]
+                {
+                    let solved = triangulator.solve(x, y, &exact([column, f64::NAN])).unwrap();
+                    let z = bisect(&calibration, ray, column);
+                    assert!((solved.point_mm[2] - z).abs() < 1e-8 * z, "{} against {z}", solved.point_mm[2]);
+                }
+            }
+        }
+    }
+
+    fn any_rig() -> impl Strategy<Value = Calibration> {
+        let baseline = (20.0..250.0f64, -3.1..3.1f64, -40.0..40.0f64);
+        (baseline, -0.1..0.1f64, prop::array::uniform5(-1.0..1.0f64), 300.0..760.0f64).prop_map(
+            |((length, angle, forward), roll, d, cy)| {
+                let mut calibration = rig(16.0);
+                let centre = Vector3::new(length * angle.cos(), length * angle.sin(), forward);
+                let pose = looking_at(centre, Vector3::new(5.0, -8.0, 1000.0), roll);
+                let scale = [0.1, 0.1, 2e-3, 2e-3, 0.02];
+                let mut lens = calibration.projector.unwrap().lens;
+                lens.cy = cy;
+                lens.distortion = std::array::from_fn(|k| d[k] * scale[k]);
+                calibration.projector = Some(Projector { lens, projector_from_camera: pose });
+                calibration
+            },
+        )
+    }
+
+    proptest! {
+        #[test]
+        fn recovers_points_of_random_rigs(
+            calibration in any_rig(), x in 0usize..100, y in 0usize..75, z in 500.0..2000.0f64,
+            sigma_column in 0.01..1.0f64, sigma_row in 0.01..1.0f64,
+        ) {
+            let triangulator = Triangulator::new(&calibration).unwrap();
+            let point = calibration.camera.ray([x as f64, y as f64]).unwrap() * z;
+            let [column, row] = truth(&calibration, &point);
+            let both = Measurement { column, sigma_column, row, sigma_row };
+            let solved = triangulator.solve(x, y, &both).unwrap();
+            // Where the rows are left out the column alone must carry the depth.
+            prop_assume!(solved.rows_per_column.abs() < 1e3 || triangulator.rows_carry_depth());
+            for k in 0..3 {
+                prop_assert!((solved.point_mm[k] - point[k]).abs() < 1e-6, "{:?} {point:?}", solved.point_mm);
+            }
+            prop_assert!(solved.row_error_px.abs() < 1e-6, "{}", solved.row_error_px);
+            // One axis alone knows less, and never knows it better.
+            let column_only = Measurement { row: f64::NAN, ..both };
+            if let Some(alone) = triangulator.solve(x, y, &column_only) {
+                prop_assert!(alone.sigma_z_mm >= solved.sigma_z_mm * (1.0 - 1e-9));
+                prop_assert!(alone.row_error_px.is_nan());
+            }
+        }
+
+        #[test]
+        fn sigma_z_is_the_derivative(calibration in any_rig(), x in 0usize..100, y in 0usize..75, z in 600.0..1500.0f64) {
+            let triangulator = Triangulator::new(&calibration).unwrap();
+            let ray = calibration.camera.ray([x as f64, y as f64]).unwrap();
+            let (sigma, h) = (0.07, 0.05);
+            let (a, b) = (truth(&calibration, &(ray * (z - h))), truth(&calibration, &(ray * (z + h))));
+            let slope = [(b[0] - a[0]) / (2.0 * h), (b[1] - a[1]) / (2.0 * h)];
+            prop_assume!(slope[0].abs() > 1e-3);
+            let column = truth(&calibration, &(ray * z))[0];
+            let one = Measurement { column, sigma_column: sigma, row: f64::NAN, sigma_row: f64::NAN };
+            let solved = triangulator.solve(x, y, &one).unwrap();
+            let expected = sigma / slope[0].abs();
+            prop_assert!((solved.sigma_z_mm / expected - 1.0).abs() < 1e-4, "{} {expected}", solved.sigma_z_mm);
+            prop_assert!((solved.rows_per_column - slope[1] / slope[0]).abs() < 1e-4 * (1.0 + (slope[1] / slope[0]).abs()));
+        }
+
+        #[test]
+        fn no_measurement_panics(
+            column in any::<f64>(), row in any::<f64>(), sigma_column in any::<f64>(), sigma_row in any::<f64>(),
+        ) {
+            let triangulator = Triangulator::new(&two_axis_rig(100.0)).unwrap();
+            let solved = triangulator.solve(3, 4, &Measurement { column, sigma_column, row, sigma_row });
+            if let Some(solved) = solved {
+                prop_assert!(solved.point_mm.iter().all(|v| v.is_finite()) && solved.sigma_z_mm > 0.0);
+            }
+        }
+    }
+
+    /// The weighed depth is the least-squares one: a brute-force scan of the cost finds no better.
+    #[test]
+    fn weighs_rows_by_information() {
+        let calibration = two_axis_rig(8.0);
+        let triangulator = Triangulator::new(&calibration).unwrap();
+        assert!(triangulator.rows_carry_depth() && triangulator.rows_per_column() > 0.5);
+        let ray = calibration.camera.ray([60.0, 40.0]).unwrap();
+        let [u, v] = truth(&calibration, &(ray * 1000.0));
+        let (sigma_column, sigma_row) = (0.3, 0.1);
+        let measured = Measurement { column: u + 0.4, sigma_column, row: v - 0.1, sigma_row };
+        let solved = triangulator.solve(60, 40, &measured).unwrap();
+        let cost = |z: f64| {
+            let at = truth(&calibration, &(ray * z));
+            ((at[0] - measured.column) / sigma_column).powi(2) + ((at[1] - measured.row) / sigma_row).powi(2)
+        };
+        let best =
+            (0..400_000).map(|i| 980.0 + f64::from(i) * 1e-4).min_by(|a, b| cost(*a).total_cmp(&cost(*b)));
+        assert!((solved.point_mm[2] - best.unwrap()).abs() < 1e-3, "{} {best:?}", solved.point_mm[2]);
+    }
+
+    #[test]
+    fn rows_are_fixed_by_the_pixel_on_a_horizontal_baseline() {
+        let triangulator = Triangulator::new(&rig(8.0)).unwrap();
+        assert!(!triangulator.rows_carry_depth());
+        // 64 columns of error move the predicted row by under 0.6 px.
+        assert!(triangulator.rows_per_column() * 64.0 < 0.6, "{}", triangulator.rows_per_column());
+        let [u, v] = truth(&rig(8.0), &(rig(8.0).camera.ray([90.0, 70.0]).unwrap() * 990.0));
+        let measured = Measurement { column: u, sigma_column: 0.05, row: v + 3.0, sigma_row: 0.05 };
+        let solved = triangulator.solve(90, 70, &measured).unwrap();
+        assert!((solved.point_mm[2] - 990.0).abs() < 1e-6, "a wrong row does not touch the depth");
+        assert!(
+            (solved.row_error_px - 3.0).abs() < 0.01,
+            "measured minus predicted row: {}",
+            solved.row_error_px
+        );
+    }
+
+    #[test]
+    fn refuses_what_cannot_triangulate() {
+        let alone = Calibration { projector: None, ..rig(8.0) };
+        assert_eq!(Triangulator::new(&alone).unwrap_err(), TriangulateError::NoProjector);
+        let mut bad = rig(8.0);
+        bad.camera.fx = f64::NAN;
+        assert!(Triangulator::new(&bad).unwrap_err().to_string().contains("fx is NaN"));
     }
 }

@@ -153,8 +153,10 @@ impl Reader {
             self.fault(format!("{section}.{key} is missing"));
             return None;
         };
-        let shape =
-            if rows == 0 { format!("{N} numbers") } else { format!("{rows} rows of {} numbers", N / rows) };
+        let shape = match N.checked_div(rows) {
+            None => format!("{N} numbers"),
+            Some(columns) => format!("{rows} rows of {columns} numbers"),
+        };
         let list = |value: Value, len: usize| match value {
             Value::Array(items) if items.len() == len => Some(items),
             _ => None,

@@ -142,7 +142,7 @@ pub(super) fn side(value: f64) -> Option<u32> {
 /// checks to refuse.
 fn nearest_rotation(m: Matrix3<f64>) -> Matrix3<f64> {
     let error = (m.transpose() * m - Matrix3::identity()).abs().max();
-    if !error.is_finite() || error > PRINTED_ROTATION || error < 1e-14 {
+    if !(1e-14..=PRINTED_ROTATION).contains(&error) {
         return m;
     }
     let svd = SVD::new(m, true, true);
