@@ -5,5 +5,6 @@ pub mod cloud;
 pub mod decode;
 pub mod geometry;
 pub mod grid;
+pub mod report;
 pub mod sequencer;
 pub mod truth;
