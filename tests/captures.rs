@@ -11,6 +11,7 @@ use std::{
     process::Command,
 };
 
+use image::{ImageBuffer, Luma};
 use serde_json::Value;
 use tempfile::TempDir;
 
@@ -28,29 +29,32 @@ const AGREE: f64 = 0.999;
 /// Largest rms of the wall in mm. The reference's own integer codes give 0.76 mm and 0.78 mm on the two regions.
 const WALL_RMS_MM: f64 = 1.2;
 
+/// Largest error of the board's median depth, in units of the chessboard rig.
+const DEPTH_ERROR: f64 = 2.0;
+
 #[test]
 fn procam_chess_0() {
-    procam_chess(0);
+    procam_chess(0, [440, 360, 300, 260], 3646.1);
 }
 
 #[test]
 fn procam_chess_1() {
-    procam_chess(1);
+    procam_chess(1, [440, 360, 200, 200], 3324.9);
 }
 
 #[test]
 fn procam_chess_2() {
-    procam_chess(2);
+    procam_chess(2, [440, 360, 300, 260], 3257.2);
 }
 
 #[test]
 fn procam_chess_3() {
-    procam_chess(3);
+    procam_chess(3, [440, 360, 300, 260], 3535.4);
 }
 
 #[test]
 fn procam_chess_4() {
-    procam_chess(4);
+    procam_chess(4, [440, 360, 300, 260], 3469.5);
 }
 
 /// The projector of this rig has a curved response, which shows as a pair sum that fails at the stripes only; the
@@ -75,11 +79,36 @@ fn steve_cam0() {
     assert!(decode.out.join("cloud.ply").is_file(), "a calibrated decode writes a cloud");
 }
 
-fn procam_chess(number: u32) {
+/// Decodes one pose. `depth` is the median z of a window [x, y, width, height] on the board in units of its author,
+/// triangulated from the reference's rows by a few lines of numpy with OpenCV's undistortion.
+///
+/// The baseline of this rig is vertical: depth comes from rows, and columns alone would say next to nothing.
+fn procam_chess(number: u32, window: [usize; 4], depth: f64) {
     let name = format!("procam-chess-{number}");
     let Some(decode) = Decode::of(&name, "procam-chess", &[]) else { return };
     decode.assert_agrees_with(&format!("procam-chess/reference/capture_{number}"));
     assert_ne!(decode.report["verdict"], "failed", "reasons: {}", decode.report["reasons"]);
+
+    let reference = decode.reference(&format!("procam-chess/reference/capture_{number}_row_u16.png"));
+    let map = Npy::read(&decode.out.join("maps.npz"), "depth");
+    let values = map.floats();
+    let [left, top, width, height] = window;
+    let pixels = (top..top + height).flat_map(|y| (left..left + width).map(move |x| (x, y)));
+    let on_board: Vec<f32> = pixels
+        .filter(|&(x, y)| reference.get_pixel(x as u32, y as u32).0[0] != u16::MAX)
+        .map(|(x, y)| values[y * map.shape[1] + x])
+        .collect();
+    let mut known: Vec<f32> = on_board.iter().copied().filter(|z| z.is_finite()).collect();
+    let share = known.len() as f64 / on_board.len() as f64;
+    assert!(share >= KEPT, "{name}: {share:.4} of the board has a depth");
+    known.sort_by(f32::total_cmp);
+    let median = f64::from(known[known.len() / 2]);
+    println!(
+        "captures: {name}: board at {median:.1}, reference {depth:.1}, {:.2} % with depth",
+        100.0 * share
+    );
+    // One row is 10 units of depth here, so the bound is a fifth of a row: rows off by half a pixel would fail.
+    assert!((median - depth).abs() < DEPTH_ERROR, "{name}: {median} is not {depth}");
 }
 
 /// One run of `polscan decode` and what it wrote.
@@ -130,6 +159,12 @@ impl Decode {
     fn reasons(&self) -> Vec<&str> {
         let reasons = self.report["reasons"].as_array().expect("report.reasons is a list");
         reasons.iter().map(|reason| reason["type"].as_str().expect("a reason has a type")).collect()
+    }
+
+    /// A map of integer codes among the captures, 65535 = none.
+    fn reference(&self, path: &str) -> ImageBuffer<Luma<u16>, Vec<u16>> {
+        let path = self.captures.join(path);
+        image::open(&path).unwrap_or_else(|e| panic!("{}: {e}", path.display())).into_luma16()
     }
 
     /// Compares column and row with `PREFIX_col_u16.png` and `PREFIX_row_u16.png` among the captures.
