@@ -5,5 +5,7 @@ pub mod cloud;
 pub mod decode;
 pub mod geometry;
 pub mod grid;
+pub mod report;
 pub mod sequencer;
+pub mod store;
 pub mod truth;
