@@ -7,4 +7,5 @@ pub mod geometry;
 pub mod grid;
 pub mod report;
 pub mod sequencer;
+pub mod store;
 pub mod truth;

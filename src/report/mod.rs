@@ -3,7 +3,9 @@
 mod accuracy;
 mod build;
 mod capture;
+pub mod colormap;
 mod diagnosis;
+pub mod pictures;
 mod plane;
 mod region;
 mod statistics;

@@ -1,0 +1,149 @@
+//! The simulated projector.
+
+use std::{sync::Arc, time::Duration};
+
+use super::rig::{Device, Shared, Taken};
+use crate::{
+    camera::Listing,
+    error::DeviceError,
+    projector::{
+        PresentReceipt, Projector, ProjectorDriver, ProjectorInfo, ProjectorTiming, ReceiptMethod, Slide,
+    },
+};
+
+const SERIAL: &str = "sim-projector-0";
+const MODEL: &str = "simulated LCD projector";
+/// What is left of the previous picture when a projector counts as settled.
+const SETTLED_SHARE: f64 = 1e-3;
+
+/// Driver of a simulated rig's projector.
+#[derive(Debug, Clone)]
+pub struct SimProjectors {
+    shared: Arc<Shared>,
+}
+
+impl SimProjectors {
+    pub(crate) fn new(shared: Arc<Shared>) -> Self {
+        Self { shared }
+    }
+}
+
+impl ProjectorDriver for SimProjectors {
+    fn list(&self) -> Result<Vec<Listing>, DeviceError> {
+        Ok(vec![Listing {
+            driver: "sim".to_owned(),
+            model: MODEL.to_owned(),
+            serial: SERIAL.to_owned(),
+            unusable: None,
+        }])
+    }
+
+    fn open(&self, serial: Option<&str>) -> Result<Box<dyn Projector>, DeviceError> {
+        let taken = self.shared.take(Device::Projector, SERIAL, serial)?;
+        Ok(Box::new(SimProjector::new(taken)))
+    }
+}
+
+struct SimProjector {
+    taken: Taken,
+    info: ProjectorInfo,
+    slides: Option<Vec<Arc<Slide>>>,
+}
+
+impl SimProjector {
+    fn new(taken: Taken) -> Self {
+        let projector = &taken.shared.description.projector;
+        let timeline = taken.shared.timeline();
+        let timing = projector.states_timing.then(|| ProjectorTiming {
+            latency: Duration::from_nanos(timeline.latency_ns()),
+            settling: Duration::from_secs_f64(timeline.settling_s(SETTLED_SHARE)),
+        });
+        let info = ProjectorInfo {
+            driver: "sim".to_owned(),
+            model: MODEL.to_owned(),
+            serial: SERIAL.to_owned(),
+            width: projector.size[0],
+            height: projector.size[1],
+            refresh_period: Duration::from_nanos(timeline.period_ns()),
+            timing,
+        };
+        drop(timeline);
+        Self { taken, info, slides: None }
+    }
+
+    /// Flips at the next refresh and waits for it. Scripted faults of the display (a flip that is late, lost or torn)
+    /// belong here, between the request and the timeline.
+    fn flip(&mut self, index: Option<u32>, slide: Option<Arc<Slide>>) -> PresentReceipt {
+        let shared = &self.taken.shared;
+        let (refresh, flipped) = {
+            // The clock is read under the lock: whoever looks up a past exposure has then seen all of its flips.
+            let mut timeline = shared.timeline();
+            timeline.flip(shared.clock.now(), slide)
+        };
+        shared.clock.sleep_until(flipped);
+        PresentReceipt { slide: index, flipped, refresh: Some(refresh), method: ReceiptMethod::Simulated }
+    }
+}
+
+/// Refuses a slide that is not of the projector's native size.
+pub(crate) fn check_slide(info: &ProjectorInfo, number: usize, slide: &Slide) -> Result<(), DeviceError> {
+    let (width, height) = (info.width as usize, info.height as usize);
+    let (kind, has, needs) = match slide {
+        Slide::Uniform(_) => return Ok(()),
+        Slide::Columns(values) => ("columns", values.len(), width),
+        Slide::Rows(values) => ("rows", values.len(), height),
+        Slide::Full(values) => ("pixels", values.len(), width * height),
+    };
+    if has == needs {
+        return Ok(());
+    }
+    Err(DeviceError::Refused {
+        device: info.serial.clone(),
+        setting: "slide size",
+        requested: format!("{has} {kind} in slide {number}"),
+        offered: format!("{needs} ({width} x {height})"),
+    })
+}
+
+/// The refusal of a slide number that is not loaded.
+pub(crate) fn no_such_slide(info: &ProjectorInfo, index: u32, loaded: usize) -> DeviceError {
+    DeviceError::Refused {
+        device: info.serial.clone(),
+        setting: "slide number",
+        requested: index.to_string(),
+        offered: format!("{loaded} slides, numbered from 0"),
+    }
+}
+
+impl Projector for SimProjector {
+    fn info(&self) -> &ProjectorInfo {
+        &self.info
+    }
+
+    fn load(&mut self, slides: &[Slide]) -> Result<(), DeviceError> {
+        for (number, slide) in slides.iter().enumerate() {
+            check_slide(&self.info, number, slide)?;
+        }
+        self.slides = Some(slides.iter().cloned().map(Arc::new).collect());
+        Ok(())
+    }
+
+    fn show(&mut self, index: u32) -> Result<PresentReceipt, DeviceError> {
+        let Some(slides) = &self.slides else {
+            return Err(DeviceError::OutOfOrder {
+                device: self.info.serial.clone(),
+                operation: "show",
+                state: "no slides are loaded",
+            });
+        };
+        let slide = slides
+            .get(index as usize)
+            .cloned()
+            .ok_or_else(|| no_such_slide(&self.info, index, slides.len()))?;
+        Ok(self.flip(Some(index), Some(slide)))
+    }
+
+    fn black(&mut self) -> Result<PresentReceipt, DeviceError> {
+        Ok(self.flip(None, None))
+    }
+}
