@@ -310,6 +310,7 @@ mod tests {
             noise_estimated: false,
             black_level_dn: 0.0,
             pairs: Vec::new(),
+            boundaries: Vec::new(),
             drift: None,
             losses: Vec::new(),
         };
