@@ -5,6 +5,7 @@ mod devices;
 mod failure;
 mod patterns;
 mod progress;
+mod results;
 mod scan;
 
 pub use decode::{DecodeArgs, decode};

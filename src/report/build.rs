@@ -240,8 +240,7 @@ fn plane_of(
             valid += u64::from(class.is_valid());
         }
     }
-    let points: Vec<_> =
-        input.reconstruction.map(|made| points(made, inside).collect()).unwrap_or_default();
+    let points: Vec<_> = input.reconstruction.map(|made| points(made, inside).collect()).unwrap_or_default();
     let fit = plane::fit_plane(&points);
     PlaneReport {
         name: name.to_owned(),
@@ -272,10 +271,8 @@ fn capture(input: &ReportInput) -> CaptureReport {
 }
 
 fn pair_residual(pairs: &[PairResidual]) -> Option<PairResidualReport> {
-    let worst = pairs
-        .iter()
-        .filter(|pair| pair.sigma.is_finite())
-        .max_by(|a, b| a.sigma.total_cmp(&b.sigma))?;
+    let worst =
+        pairs.iter().filter(|pair| pair.sigma.is_finite()).max_by(|a, b| a.sigma.total_cmp(&b.sigma))?;
     let mut sigmas: Vec<f64> = pairs.iter().filter_map(|pair| statistics::finite(pair.sigma)).collect();
     Some(PairResidualReport {
         median: statistics::median(&mut sigmas)?,

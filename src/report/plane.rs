@@ -156,7 +156,8 @@ mod tests {
     #[test]
     fn p95_is_that_of_the_distances() {
         // 10 of 441 points off by 3 mm: 2.3 %, beyond the 95th percentile, yet in the rmse.
-        let points = sheet(10, upright(), |x, y| if y == 0.0 && x.abs() <= 5.0 && x != 0.0 { 3.0 } else { 0.0 });
+        let points =
+            sheet(10, upright(), |x, y| if y == 0.0 && x.abs() <= 5.0 && x != 0.0 { 3.0 } else { 0.0 });
         let fit = fit_plane(&points).unwrap();
         assert!(fit.p95_mm < 0.2, "{}", fit.p95_mm);
         assert!((fit.rmse_mm - (10.0f64 * 9.0 / 441.0).sqrt()).abs() < 0.02, "{}", fit.rmse_mm);

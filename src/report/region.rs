@@ -32,7 +32,9 @@ pub struct NamedRegion {
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
 pub enum RegionError {
     /// Not of the form `NAME=x,y,w,h`.
-    #[error("region `{text}` is not of the form NAME=x,y,w,h with whole numbers, for example plate=100,80,640,480")]
+    #[error(
+        "region `{text}` is not of the form NAME=x,y,w,h with whole numbers, for example plate=100,80,640,480"
+    )]
     Form {
         /// What was given.
         text: String,
@@ -144,7 +146,9 @@ mod tests {
                 let all = (-2..=2).all(|dy| {
                     (-2..=2).all(|dx| {
                         let (x, y) = (x + dx, y + dy);
-                        (0..w).contains(&x) && (0..h).contains(&y) && labels.at(x as usize, y as usize) == label
+                        (0..w).contains(&x)
+                            && (0..h).contains(&y)
+                            && labels.at(x as usize, y as usize) == label
                     })
                 });
                 if all {

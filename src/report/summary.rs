@@ -149,12 +149,8 @@ fn planes(text: &mut Text, report: &Report) {
 }
 
 fn accuracy(of: &Accuracy) -> String {
-    let mut line = format!(
-        "{} measured, {} of {} wrong",
-        percent(of.coverage),
-        grouped(of.wrong),
-        grouped(of.valid)
-    );
+    let mut line =
+        format!("{} measured, {} of {} wrong", percent(of.coverage), grouped(of.wrong), grouped(of.valid));
     if let Some(rms) = of.column_rms_px {
         let _ = write!(line, "; columns {rms:.3} px rms");
     }

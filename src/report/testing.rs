@@ -25,7 +25,12 @@ pub fn settings(width: usize, height: usize) -> DecodeSettings {
         row: AxisCode::centred(PROJECTOR.height).unwrap(),
         width,
         height,
-        camera: CameraResponse { bit_depth: 12, black_level_dn: Some(41.0), saturation_dn: 4095, noise: None },
+        camera: CameraResponse {
+            bit_depth: 12,
+            black_level_dn: Some(41.0),
+            saturation_dn: 4095,
+            noise: None,
+        },
         thresholds: Default::default(),
     }
 }

@@ -219,7 +219,12 @@ impl Full {
                 for (y, wy) in down.1.iter().enumerate() {
                     let row = &values[(down.0 + y) * width + across.0..];
                     sum += wy
-                        * across.1.iter().zip(row).map(|(wx, rgb)| wx * self.panel.light(rgb[channel])).sum::<f64>();
+                        * across
+                            .1
+                            .iter()
+                            .zip(row)
+                            .map(|(wx, rgb)| wx * self.panel.light(rgb[channel]))
+                            .sum::<f64>();
                 }
                 *light += (weight * sum / total) as f32;
             }

@@ -110,7 +110,9 @@ pub(crate) fn nearest(
     primitives
         .iter()
         .enumerate()
-        .filter_map(|(number, primitive)| primitive.shape.meet(origin, along).map(|distance| (number, distance)))
+        .filter_map(|(number, primitive)| {
+            primitive.shape.meet(origin, along).map(|distance| (number, distance))
+        })
         .min_by(|a, b| a.1.total_cmp(&b.1))
 }
 
@@ -185,8 +187,7 @@ mod tests {
                 let theta = (f64::from(ring) + 0.5) / f64::from(rings) * std::f64::consts::FRAC_PI_2;
                 for spoke in 0..spokes {
                     let phi = (f64::from(spoke) + 0.5) / f64::from(spokes) * std::f64::consts::TAU;
-                    let view =
-                        Vector3::new(theta.sin() * phi.cos(), theta.sin() * phi.sin(), theta.cos());
+                    let view = Vector3::new(theta.sin() * phi.cos(), theta.sin() * phi.sin(), theta.cos());
                     // Reflected share of the irradiance: BRDF cos_o over the hemisphere.
                     sum += lobe(alpha, normal, light, view) / normal.dot(&light) * theta.cos() * theta.sin();
                 }

@@ -3,6 +3,7 @@
 //! Every threshold is in units of noise or a share of something, and says where it comes from. A sound scan has no
 //! reason at all; what is merely worth knowing is a note of the report.
 
+mod captured;
 mod field;
 mod order;
 mod pairs;
@@ -53,11 +54,17 @@ pub enum Diagnosis {
     SensorDefect,
     /// Few of the lit pixels gave a measurement.
     LowCoverage,
+    /// A device failed, or did not end as it should.
+    DeviceFault,
+    /// Part of the proof that frames and pictures belong together is missing.
+    CaptureUnproven,
+    /// The capture was cancelled.
+    Cancelled,
 }
 
 impl Diagnosis {
     /// All of them, in the order of the documentation.
-    pub const ALL: [Self; 17] = [
+    pub const ALL: [Self; 20] = [
         Self::StaleFrame,
         Self::LostFrame,
         Self::TornFrame,
@@ -75,6 +82,9 @@ impl Diagnosis {
         Self::RowMismatch,
         Self::SensorDefect,
         Self::LowCoverage,
+        Self::DeviceFault,
+        Self::CaptureUnproven,
+        Self::Cancelled,
     ];
 
     /// Its name in files.
@@ -97,6 +107,9 @@ impl Diagnosis {
             Self::RowMismatch => "row-mismatch",
             Self::SensorDefect => "sensor-defect",
             Self::LowCoverage => "low-coverage",
+            Self::DeviceFault => "device-fault",
+            Self::CaptureUnproven => "capture-unproven",
+            Self::Cancelled => "cancelled",
         }
     }
 
@@ -209,7 +222,8 @@ mod tests {
 
     #[test]
     fn each_row_of_the_documentation_says_what_is_seen_why_and_what_to_do() {
-        for line in include_str!("../../../docs/diagnoses.md").lines().filter(|line| line.starts_with("| `")) {
+        for line in include_str!("../../../docs/diagnoses.md").lines().filter(|line| line.starts_with("| `"))
+        {
             let cells: Vec<_> = line.trim_matches('|').split('|').map(str::trim).collect();
             assert_eq!(cells.len(), 4, "{line}");
             assert!(cells.iter().all(|cell| cell.len() > 8), "{line}");

@@ -123,8 +123,7 @@ fn judge(
     for &[here, right, below, next] in places {
         let word = |index| Some((column(index)?, row(index)?));
         let (Some(here), Some(right), Some(below)) = (word(here), word(right), word(below)) else { continue };
-        let (across, down) =
-            ((right.0 - here.0, right.1 - here.1), (below.0 - here.0, below.1 - here.1));
+        let (across, down) = ((right.0 - here.0, right.1 - here.1), (below.0 - here.0, below.1 - here.1));
         let area = across.0 * down.1 - across.1 * down.0;
         if area.abs() < LEAST_AREA {
             continue;

@@ -102,8 +102,7 @@ pub fn diagnose(decoded: &Decoded, modulation_drift: Option<f64>) -> Vec<Reason>
         coarse.clone_from(&views);
     }
     let modulation = field::modulation_sigma(decoded);
-    let (shifted, rest): (Vec<View>, Vec<View>) =
-        coarse.iter().partition(|view| view.is_shifted(modulation));
+    let (shifted, rest): (Vec<View>, Vec<View>) = coarse.iter().partition(|view| view.is_shifted(modulation));
     let (disturbed, sound): (Vec<View>, Vec<View>) = rest.iter().partition(|view| view.is_disturbed());
 
     let mut reasons = Vec::new();
@@ -199,8 +198,7 @@ fn drift_reason(drift: Option<f64>, modulation: Option<f64>, trend: f64, shifted
         }
         None => format!("the light changed steadily over {}", names(shifted)),
     };
-    let evidence =
-        json!({ "drift": drift, "modulation_drift": modulation, "trend": trend, "pairs": all_evidence(shifted) });
+    let evidence = json!({ "drift": drift, "modulation_drift": modulation, "trend": trend, "pairs": all_evidence(shifted) });
     let lamp = drift.zip(modulation).map(|(drift, modulation)| modulation.abs() >= LAMP_SHARE * drift.abs());
     if lamp == Some(false) {
         return Reason::degraded(
@@ -337,8 +335,8 @@ fn lone<'a>(fine: &[View<'a>], modulation: Option<f64>) -> Option<View<'a>> {
     let bad = worst(fine, |view| view.outliers()).filter(|view| view.outliers() > LONE_OUTLIERS)?;
     let others = fine.iter().filter(|view| !std::ptr::eq(view.pair, bad.pair));
     let alone = fine.len() > 1 && others.clone().all(|view| view.outliers() < SOUND_OUTLIERS);
-    let strong =
-        modulation.is_none_or(|modulation| bad.sigma().max(bad.shift.abs()) >= 0.5 * STALE_SHARE * modulation);
+    let strong = modulation
+        .is_none_or(|modulation| bad.sigma().max(bad.shift.abs()) >= 0.5 * STALE_SHARE * modulation);
     // A stale frame may be off by the modulation both ways and not at all on half of the pixels.
     (alone && (strong || bad.shift.abs() < SHIFT_SIGMA)).then_some(bad)
 }
@@ -355,7 +353,10 @@ fn nonlinear(sound: &[View], fine: &[View]) -> Option<Reason> {
     }
     let mut seen = Vec::new();
     if edges > EDGE_OUTLIERS {
-        seen.push(format!("{:.0} % of the pixels at stripe edges do not add up to the references", 100.0 * edges));
+        seen.push(format!(
+            "{:.0} % of the pixels at stripe edges do not add up to the references",
+            100.0 * edges
+        ));
     }
     if let Some(view) = worst_fine {
         seen.push(format!(

@@ -58,9 +58,7 @@ pub fn diagnose(input: &ReportInput, pixels: Option<&PixelCounts>) -> Vec<Reason
                 reasons.extend(wrong_order(input, decoded, pixels));
                 reasons.extend(polarization(input, decoded, pixels));
                 reasons.extend(saturated(decoded, pixels));
-                reasons.extend(
-                    input.reconstruction.and_then(|made| made.row_check).and_then(row_mismatch),
-                );
+                reasons.extend(input.reconstruction.and_then(|made| made.row_check).and_then(row_mismatch));
                 reasons.extend(sensor_defect(decoded, pixels));
                 reasons.extend(low_coverage(pixels));
             }
@@ -107,7 +105,8 @@ fn frames(capture: &CaptureSummary) -> Vec<Reason> {
         ));
     }
     // A lost frame that was noticed and taken again has cost time, nothing else.
-    let retaken = capture.retaken.iter().filter(|retake| retake.reason == Diagnosis::LostFrame.slug()).count();
+    let retaken =
+        capture.retaken.iter().filter(|retake| retake.reason == Diagnosis::LostFrame.slug()).count();
     let lost = capture.lost_frames();
     if lost > 2 * retaken as u64 {
         reasons.push(Reason::degraded(
@@ -302,7 +301,8 @@ fn sensor_defect(decoded: &Decoded, pixels: &PixelCounts) -> Option<Reason> {
                 rows[y][0] += 1;
                 rows[y][1] += failed;
             }
-            let corners = || valid(x - 1, y - 1) && valid(x + 1, y - 1) && valid(x - 1, y + 1) && valid(x + 1, y + 1);
+            let corners =
+                || valid(x - 1, y - 1) && valid(x + 1, y - 1) && valid(x - 1, y + 1) && valid(x + 1, y + 1);
             dead += u64::from(class.at(x, y) == Class::Unlit && beside && above && corners());
         }
     }
@@ -333,14 +333,38 @@ fn sensor_defect(decoded: &Decoded, pixels: &PixelCounts) -> Option<Reason> {
 fn low_coverage(pixels: &PixelCounts) -> Option<Reason> {
     let coverage = share(pixels.valid, pixels.lit).filter(|&coverage| coverage < POOR_COVERAGE)?;
     let causes = [
-        (pixels.ambiguous, "ambiguous", "the fine stripes are blurred or the light is weak: focus the projector, or expose longer"),
+        (
+            pixels.ambiguous,
+            "ambiguous",
+            "the fine stripes are blurred or the light is weak: focus the projector, or expose longer",
+        ),
         (pixels.saturated, "saturated", "there is too much light: shorten the exposure"),
-        (pixels.off_boundary, "off_boundary", "stripe edges lie in the wrong places: check the order of the frames"),
-        (pixels.out_of_projector, "out_of_projector", "words do not belong to this projector: check its size, the code offset and the code bits"),
-        (pixels.out_of_volume, "out_of_volume", "depths lie outside the working volume: check `near_mm` and `far_mm`, and the calibration"),
+        (
+            pixels.off_boundary,
+            "off_boundary",
+            "stripe edges lie in the wrong places: check the order of the frames",
+        ),
+        (
+            pixels.out_of_projector,
+            "out_of_projector",
+            "words do not belong to this projector: check its size, the code offset and the code bits",
+        ),
+        (
+            pixels.out_of_volume,
+            "out_of_volume",
+            "depths lie outside the working volume: check `near_mm` and `far_mm`, and the calibration",
+        ),
         (pixels.rejected_by_row, "rejected_by_row", "rows disagree with the calibration: calibrate again"),
-        (pixels.rejected_by_vote, "rejected_by_vote", "neighbouring pixels disagree: the image is noisy or something moved"),
-        (pixels.interreflection, "interreflection", "light comes by way of other surfaces: cover shiny things beside the object"),
+        (
+            pixels.rejected_by_vote,
+            "rejected_by_vote",
+            "neighbouring pixels disagree: the image is noisy or something moved",
+        ),
+        (
+            pixels.interreflection,
+            "interreflection",
+            "light comes by way of other surfaces: cover shiny things beside the object",
+        ),
     ];
     let (lost, name, cause) = causes.into_iter().max_by_key(|(count, ..)| *count)?;
     let message = format!(
@@ -368,7 +392,8 @@ pub fn notes(input: &ReportInput, pixels: Option<&PixelCounts>) -> Vec<String> {
     notes.extend(decoded.losses.iter().map(|loss| format!("lost by missing frames: {loss}")));
     if decoded.noise_estimated {
         notes.push(
-            "the camera's noise was estimated from these frames; `polscan calibrate noise` measures it".to_owned(),
+            "the camera's noise was estimated from these frames; `polscan calibrate noise` measures it"
+                .to_owned(),
         );
     }
     if input.reconstruction.is_none() {
@@ -383,7 +408,8 @@ pub fn notes(input: &ReportInput, pixels: Option<&PixelCounts>) -> Vec<String> {
             );
         }
         if !capture.retaken.is_empty() {
-            notes.push(format!("{} captured again, then sound", plural(capture.retaken.len() as u64, "pair")));
+            notes
+                .push(format!("{} captured again, then sound", plural(capture.retaken.len() as u64, "pair")));
         }
     }
     let inverted = share(pixels.inverted, pixels.lit).unwrap_or(0.0);
