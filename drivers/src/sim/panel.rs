@@ -9,6 +9,12 @@ use crate::projector::{Rgb, Slide};
 /// Entries of a profile table per projector pixel. Linear interpolation of the profile of an edge with blur s (px) is
 /// then off by at most 7e-6 / s^2.
 const PER_PIXEL: usize = 64;
+/// Bits of a position below a whole entry.
+const FRACTION_BITS: u32 = 11;
+/// Widest blur that descriptions may have, in px.
+pub(crate) const WIDEST_BLUR_PX: f64 = 20.0;
+/// Neighbours that the widest blur reaches, both ways, and one between.
+const MOST_NEIGHBOURS: usize = 2 * 115 + 2;
 
 /// Light per channel: red, green, blue, nothing. The fourth keeps the compiler's vectors whole.
 pub(crate) type Channels = [f32; 4];
@@ -85,24 +91,50 @@ impl Panel {
     /// Table of one axis from the light of its pixels.
     fn table(&self, axis: usize, lights: &[[f64; 3]]) -> Table {
         let margin = self.margin();
-        let entries = (self.size[axis] + 2 * margin) * PER_PIXEL + 1;
+        let entries = (self.size[axis] + 2 * margin) * PER_PIXEL + 2;
         let mut values = vec![[0.0f32; 4]; entries];
         for channel in 0..3 {
-            let shift = self.shift_px[channel][axis];
+            // Channels of one polarization mostly show the same.
+            let twin = (0..channel).find(|&other| {
+                self.shift_px[other][axis] == self.shift_px[channel][axis]
+                    && lights.iter().all(|light| light[other] == light[channel])
+            });
+            if let Some(twin) = twin {
+                values.iter_mut().for_each(|value| value[channel] = value[twin]);
+                continue;
+            }
+            let column: Vec<f64> = lights.iter().map(|light| light[channel]).collect();
+            let start = -(margin as f64) - self.shift_px[channel][axis];
             // The weights of the neighbours repeat from pixel to pixel.
-            for phase in 0..PER_PIXEL {
-                let base = phase as f64 / PER_PIXEL as f64 - margin as f64 - shift;
-                let first = base.floor() as i64 - self.reach as i64;
-                let weights: Vec<f64> = (0..2 * self.reach as i64 + 2)
-                    .map(|neighbour| blurred_box(base - (first + neighbour) as f64, self.blur_px))
-                    .collect();
-                for (pixel, entry) in (phase..entries).step_by(PER_PIXEL).enumerate() {
-                    let start = first + pixel as i64;
-                    values[entry][channel] = weighted(lights, channel, start, &weights) as f32;
+            let phases: Vec<(i64, Vec<f64>)> = (0..PER_PIXEL)
+                .map(|phase| self.neighbours(start + phase as f64 / PER_PIXEL as f64))
+                .collect();
+            for (pixel, entries) in values.chunks_mut(PER_PIXEL).enumerate() {
+                for (entry, (first, weights)) in entries.iter_mut().zip(&phases) {
+                    entry[channel] = weighted(&column, first + pixel as i64, weights) as f32;
                 }
             }
         }
-        Table { values, offset: (margin * PER_PIXEL) as f32 }
+        Table { values }
+    }
+
+    /// Pixels that give light at a coordinate: the first of them, and the weights from there on.
+    fn neighbours(&self, at: f64) -> (i64, Vec<f64>) {
+        let first = at.floor() as i64 - self.reach as i64;
+        let count = 2 * self.reach as i64 + 2;
+        (first, (first..first + count).map(|pixel| blurred_box(at - pixel as f64, self.blur_px)).collect())
+    }
+
+    /// Position of a nominal coordinate in the tables of an axis: whole entries, and a fraction in the low bits.
+    pub(crate) fn position(&self, axis: usize, at: f64) -> u32 {
+        let margin = self.margin() as f64;
+        let within = at.clamp(-margin, self.size[axis] as f64 + margin) + margin;
+        (within * (PER_PIXEL << FRACTION_BITS) as f64).round() as u32
+    }
+
+    /// The coordinate of a position.
+    fn coordinate(&self, position: u32) -> f64 {
+        f64::from(position) / (PER_PIXEL << FRACTION_BITS) as f64 - self.margin() as f64
     }
 
     /// Pixels around the panel that tables cover.
@@ -140,44 +172,42 @@ impl Panel {
             constant: [constant[0] as f32, constant[1] as f32, constant[2] as f32, 0.0],
             columns: columns.map(|lights| self.table(0, &lights)),
             rows: rows.map(|lights| self.table(1, &lights)),
-            full: (!full.is_empty()).then(|| Full { panel: self.clone(), slides: full }),
+            full: (!full.is_empty()).then(|| Full::new(self, &full)),
         }
     }
 }
 
 /// Weighted mean of the pixels from `start` on, over those that exist. Weights of missing pixels are left out of the
 /// mean because the fall-off at the border is part of [`Panel::coverage`].
-fn weighted(lights: &[[f64; 3]], channel: usize, start: i64, weights: &[f64]) -> f64 {
+fn weighted(lights: &[f64], start: i64, weights: &[f64]) -> f64 {
+    let last = lights.len() as i64 - 1;
+    if start >= 0 && start + weights.len() as i64 - 1 <= last {
+        let seen = &lights[start as usize..start as usize + weights.len()];
+        return seen.iter().zip(weights).map(|(light, weight)| light * weight).sum();
+    }
     let (mut sum, mut total) = (0.0, 0.0);
-    for (neighbour, weight) in weights.iter().enumerate() {
-        let index = start + neighbour as i64;
-        if let Some(light) = usize::try_from(index).ok().and_then(|index| lights.get(index)) {
-            sum += weight * light[channel];
+    for (index, weight) in (start..).zip(weights) {
+        if (0..=last).contains(&index) {
+            sum += weight * lights[index as usize];
             total += weight;
         }
     }
-    if total > 1e-9 {
-        sum / total
-    } else {
-        let middle = start + weights.len() as i64 / 2;
-        lights[middle.clamp(0, lights.len() as i64 - 1) as usize][channel]
-    }
+    // Beyond the reach of the last pixel it does not matter which value is taken: nothing is lit there.
+    if total > 1e-9 { sum / total } else { lights[(start + weights.len() as i64 / 2).clamp(0, last) as usize] }
 }
 
 /// Finely sampled profile along one axis.
 #[derive(Debug, Clone)]
 pub(crate) struct Table {
     values: Vec<Channels>,
-    offset: f32,
 }
 
 impl Table {
-    /// Light at coordinate `at`; the border's value outside, anything for NaN.
+    /// Light at a [`Panel::position`].
     #[inline]
-    pub(crate) fn at(&self, at: f32) -> Channels {
-        let position = (at * PER_PIXEL as f32 + self.offset).clamp(0.0, (self.values.len() - 2) as f32);
-        let index = (position as usize).min(self.values.len() - 2);
-        let share = position - index as f32;
+    pub(crate) fn at(&self, position: u32) -> Channels {
+        let index = (position >> FRACTION_BITS) as usize;
+        let share = (position & ((1 << FRACTION_BITS) - 1)) as f32 * (1.0 / (1 << FRACTION_BITS) as f32);
         let (low, high) = (self.values[index], self.values[index + 1]);
         std::array::from_fn(|channel| low[channel] + share * (high[channel] - low[channel]))
     }
@@ -192,59 +222,94 @@ pub(crate) struct Illumination {
     pub(crate) full: Option<Full>,
 }
 
-/// Slides without structure, convolved at each look-up.
+/// Slides without structure, summed up and convolved at each look-up.
 #[derive(Debug, Clone)]
 pub(crate) struct Full {
     panel: Panel,
-    slides: Vec<(Arc<[Rgb]>, f64)>,
+    /// Row-major, per channel.
+    light: [Vec<f32>; 3],
+    /// Weights of the neighbours at each phase and, for interpolation, the next.
+    phases: Vec<Vec<f32>>,
 }
 
 impl Full {
-    /// Light at a nominal projector coordinate; nothing for NaN.
-    pub(crate) fn at(&self, u: f32, v: f32) -> Channels {
+    fn new(panel: &Panel, slides: &[(Arc<[Rgb]>, f64)]) -> Self {
+        let pixels = panel.size[0] * panel.size[1];
+        let light = std::array::from_fn(|channel| {
+            let mut light = vec![0.0f32; pixels];
+            for (values, weight) in slides {
+                let levels: Vec<f32> = (0..=255).map(|code| (weight * panel.light(code)) as f32).collect();
+                light.iter_mut().zip(values.iter()).for_each(|(sum, rgb)| *sum += levels[usize::from(rgb[channel])]);
+            }
+            light
+        });
+        let weights = |phase: usize| {
+            let (_, weights) = panel.neighbours(phase as f64 / PER_PIXEL as f64);
+            weights.into_iter().map(|weight| weight as f32).collect()
+        };
+        let mut phases: Vec<Vec<f32>> = (0..PER_PIXEL).map(weights).collect();
+        // One pixel on the same neighbours, counted from the first phase's first, end with that pixel's weights.
+        let mut wrapped = phases[0].clone();
+        wrapped.rotate_right(1);
+        phases.push(wrapped);
+        Self { panel: panel.clone(), light, phases }
+    }
+
+    /// Light at the positions of both axes.
+    pub(crate) fn at(&self, column: u32, row: u32) -> Channels {
         let mut light = [0.0f32; 4];
-        if !(u.is_finite() && v.is_finite()) {
-            return light;
-        }
-        for (channel, light) in light.iter_mut().take(3).enumerate() {
-            let across = self.weights(channel, 0, f64::from(u));
-            let down = self.weights(channel, 1, f64::from(v));
-            let total = across.1.iter().sum::<f64>() * down.1.iter().sum::<f64>();
-            if total < 1e-12 {
-                continue;
-            }
-            let width = self.panel.size[0];
-            for (values, weight) in &self.slides {
-                let mut sum = 0.0;
-                for (y, wy) in down.1.iter().enumerate() {
-                    let row = &values[(down.0 + y) * width + across.0..];
-                    sum += wy
-                        * across.1.iter().zip(row).map(|(wx, rgb)| wx * self.panel.light(rgb[channel])).sum::<f64>();
+        let (u, v) = (self.panel.coordinate(column), self.panel.coordinate(row));
+        let [width, height] = self.panel.size;
+        for channel in 0..3 {
+            let [dx, dy] = self.panel.shift_px[channel];
+            let (x, across) = self.weights(u - dx);
+            let (y, down) = self.weights(v - dy);
+            let (mut sum, mut total) = (0.0, 0.0);
+            for (line, wy) in (y..).zip(&down.0[..down.1]) {
+                if !(0..height as i64).contains(&line) {
+                    continue;
                 }
-                *light += (weight * sum / total) as f32;
+                let from = x.clamp(0, width as i64);
+                let until = (x + across.1 as i64).clamp(0, width as i64);
+                let values = &self.light[channel][line as usize * width..(line as usize + 1) * width];
+                let values = &values[from as usize..until as usize];
+                let weights = &across.0[(from - x) as usize..(until - x) as usize];
+                let (mut partial, mut share) = (0.0, 0.0);
+                for (value, weight) in values.iter().zip(weights) {
+                    partial += value * weight;
+                    share += weight;
+                }
+                sum += wy * partial;
+                total += wy * share;
             }
+            light[channel] = if total > 1e-9 { sum / total } else { 0.0 };
         }
         light
     }
 
-    /// First pixel that matters along an axis, and the weights from there.
-    fn weights(&self, channel: usize, axis: usize, at: f64) -> (usize, Vec<f64>) {
-        let at = at - self.panel.shift_px[channel][axis];
-        let last = self.panel.size[axis] as f64 - 1.0;
-        let first = (at.round() - self.panel.reach as f64).clamp(0.0, last) as usize;
-        let end = (at.round() + self.panel.reach as f64).clamp(0.0, last) as usize;
-        (first, (first..=end).map(|pixel| blurred_box(at - pixel as f64, self.panel.blur_px)).collect())
+    /// First neighbour, the weights and how many of them there are.
+    fn weights(&self, at: f64) -> (i64, ([f32; MOST_NEIGHBOURS], usize)) {
+        let whole = at.floor();
+        let phase = (at - whole) * PER_PIXEL as f64;
+        let index = (phase as usize).min(PER_PIXEL - 1);
+        let share = (phase - index as f64) as f32;
+        let (low, high) = (&self.phases[index], &self.phases[index + 1]);
+        let mut weights = [0.0; MOST_NEIGHBOURS];
+        for (weight, (low, high)) in weights.iter_mut().zip(low.iter().zip(high)) {
+            *weight = low + share * (high - low);
+        }
+        (whole as i64 - self.panel.reach as i64, (weights, low.len()))
     }
 }
 
 impl Illumination {
-    /// Light at a nominal projector coordinate.
-    pub(crate) fn at(&self, u: f32, v: f32) -> Channels {
+    /// Light at the positions of both axes.
+    pub(crate) fn at(&self, column: u32, row: u32) -> Channels {
         let mut light = self.constant;
         let parts = [
-            self.columns.as_ref().map(|table| table.at(u)),
-            self.rows.as_ref().map(|table| table.at(v)),
-            self.full.as_ref().map(|full| full.at(u, v)),
+            self.columns.as_ref().map(|table| table.at(column)),
+            self.rows.as_ref().map(|table| table.at(row)),
+            self.full.as_ref().map(|full| full.at(column, row)),
         ];
         for part in parts.into_iter().flatten() {
             light.iter_mut().zip(part).for_each(|(light, part)| *light += part);
