@@ -26,7 +26,11 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let clock = description.pacing.clock();
     let start = Instant::now();
     let rig = Rig::new(&description, &scene, clock.clone())?;
-    println!("set-up {:.0} ms, {} threads", 1e3 * start.elapsed().as_secs_f64(), rayon::current_num_threads());
+    println!(
+        "set-up {:.0} ms, {} threads",
+        1e3 * start.elapsed().as_secs_f64(),
+        rayon::current_num_threads()
+    );
 
     let mut camera = rig.cameras().open(None)?;
     let mut projector = rig.projectors().open(None)?;

@@ -375,7 +375,8 @@ impl PoseDescription {
                 let error = (rotation * rotation.transpose() - nalgebra::Matrix3::identity()).norm();
                 // Not `>`: a NaN must fail too.
                 if !(error <= 1e-6 && rotation.determinant() > 0.0) {
-                    faults.add("pose.rotation", "is not a rotation: rows must be orthonormal and right-handed");
+                    faults
+                        .add("pose.rotation", "is not a rotation: rows must be orthonormal and right-handed");
                 }
                 for (axis, &value) in translation.iter().enumerate() {
                     faults.finite(&format!("pose.translation_mm[{axis}]"), value);

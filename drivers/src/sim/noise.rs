@@ -50,7 +50,8 @@ impl Stream {
                 let word = self.word(start + index as u64);
                 (*high, *low) = ((word >> 32) as u32, word as u32);
             }
-            let few: [bool; BLOCK] = std::array::from_fn(|index| means.get(index).is_some_and(|&mean| mean < POISSON_BELOW));
+            let few: [bool; BLOCK] =
+                std::array::from_fn(|index| means.get(index).is_some_and(|&mean| mean < POISSON_BELOW));
             let any_few = few.contains(&true);
             let before: [f32; BLOCK] = std::array::from_fn(|index| means.get(index).copied().unwrap_or(0.0));
             for (index, mean) in means.iter_mut().enumerate() {
@@ -92,10 +93,12 @@ fn normal_pair(first: u32, second: u32) -> (f32, f32) {
     let uniform = ((first >> 1) as i32 as f32 + 0.5) * (1.0 / 2_147_483_648.0);
     let radius = (-2.0 * ln(uniform)).max(0.0).sqrt();
     // The quadrant comes from two bits; within it the angle runs from -pi/4 to pi/4 about its middle.
-    let angle = ((second & 0x3fff_ffff) as i32 as f32 * (1.0 / 1_073_741_824.0) - 0.5) * std::f32::consts::FRAC_PI_2;
+    let angle =
+        ((second & 0x3fff_ffff) as i32 as f32 * (1.0 / 1_073_741_824.0) - 0.5) * std::f32::consts::FRAC_PI_2;
     let square = angle * angle;
     let sin = angle * (1.0 + square * (-1.0 / 6.0 + square * (1.0 / 120.0 + square * (-1.0 / 5040.0))));
-    let cos = 1.0 + square * (-0.5 + square * (1.0 / 24.0 + square * (-1.0 / 720.0 + square * (1.0 / 40320.0))));
+    let cos =
+        1.0 + square * (-0.5 + square * (1.0 / 24.0 + square * (-1.0 / 720.0 + square * (1.0 / 40320.0))));
     let half = std::f32::consts::FRAC_1_SQRT_2 * radius;
     let across = if second & 0x4000_0000 == 0 { half } else { -half };
     let up = if second & 0x8000_0000 == 0 { half } else { -half };
@@ -132,8 +135,8 @@ mod tests {
             let radius = x.hypot(y);
             assert!((radius - (2.0 * 8f32.ln()).sqrt()).abs() < 1e-5);
             // The angle is uniform: within its quadrant it follows the low 30 bits.
-            let within = (f64::from(second & 0x3fff_ffff) / f64::from(1u32 << 30) - 0.5)
-                * std::f64::consts::FRAC_PI_2;
+            let within =
+                (f64::from(second & 0x3fff_ffff) / f64::from(1u32 << 30) - 0.5) * std::f64::consts::FRAC_PI_2;
             let base = f64::from(y).atan2(f64::from(x)) - within;
             let quarter = (base / std::f64::consts::FRAC_PI_2 - 0.5).rem_euclid(1.0);
             assert!(quarter.min(1.0 - quarter) < 1e-5, "{second} {quarter}");

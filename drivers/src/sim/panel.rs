@@ -13,8 +13,6 @@ const PER_PIXEL: usize = 64;
 const FRACTION_BITS: u32 = 11;
 /// Widest blur that descriptions may have, in px.
 pub(crate) const WIDEST_BLUR_PX: f64 = 20.0;
-/// Neighbours that the widest blur reaches, both ways, and one between.
-const MOST_NEIGHBOURS: usize = 2 * 115 + 2;
 
 /// Light per channel: red, green, blue, nothing. The fourth keeps the compiler's vectors whole.
 pub(crate) type Channels = [f32; 4];
@@ -193,7 +191,11 @@ fn weighted(lights: &[f64], start: i64, weights: &[f64]) -> f64 {
         }
     }
     // Beyond the reach of the last pixel it does not matter which value is taken: nothing is lit there.
-    if total > 1e-9 { sum / total } else { lights[(start + weights.len() as i64 / 2).clamp(0, last) as usize] }
+    if total > 1e-9 {
+        sum / total
+    } else {
+        lights[(start + weights.len() as i64 / 2).clamp(0, last) as usize]
+    }
 }
 
 /// Finely sampled profile along one axis.
@@ -239,7 +241,10 @@ impl Full {
             let mut light = vec![0.0f32; pixels];
             for (values, weight) in slides {
                 let levels: Vec<f32> = (0..=255).map(|code| (weight * panel.light(code)) as f32).collect();
-                light.iter_mut().zip(values.iter()).for_each(|(sum, rgb)| *sum += levels[usize::from(rgb[channel])]);
+                light
+                    .iter_mut()
+                    .zip(values.iter())
+                    .for_each(|(sum, rgb)| *sum += levels[usize::from(rgb[channel])]);
             }
             light
         });
@@ -262,22 +267,15 @@ impl Full {
         let [width, height] = self.panel.size;
         for channel in 0..3 {
             let [dx, dy] = self.panel.shift_px[channel];
-            let (x, across) = self.weights(u - dx);
-            let (y, down) = self.weights(v - dy);
+            let across = self.neighbours(u - dx, width);
+            let down = self.neighbours(v - dy, height);
             let (mut sum, mut total) = (0.0, 0.0);
-            for (line, wy) in (y..).zip(&down.0[..down.1]) {
-                if !(0..height as i64).contains(&line) {
-                    continue;
-                }
-                let from = x.clamp(0, width as i64);
-                let until = (x + across.1 as i64).clamp(0, width as i64);
-                let values = &self.light[channel][line as usize * width..(line as usize + 1) * width];
-                let values = &values[from as usize..until as usize];
-                let weights = &across.0[(from - x) as usize..(until - x) as usize];
+            for (line, wy) in down.pixels.clone().zip(down.weights()) {
+                let values = &self.light[channel][line * width..(line + 1) * width][across.pixels.clone()];
                 let (mut partial, mut share) = (0.0, 0.0);
-                for (value, weight) in values.iter().zip(weights) {
-                    partial += value * weight;
-                    share += weight;
+                for (value, wx) in values.iter().zip(across.weights()) {
+                    partial += value * wx;
+                    share += wx;
                 }
                 sum += wy * partial;
                 total += wy * share;
@@ -287,18 +285,35 @@ impl Full {
         light
     }
 
-    /// First neighbour, the weights and how many of them there are.
-    fn weights(&self, at: f64) -> (i64, ([f32; MOST_NEIGHBOURS], usize)) {
+    /// Pixels of an axis of `size` pixels that give light at a coordinate.
+    fn neighbours(&self, at: f64, size: usize) -> Neighbours<'_> {
         let whole = at.floor();
         let phase = (at - whole) * PER_PIXEL as f64;
         let index = (phase as usize).min(PER_PIXEL - 1);
-        let share = (phase - index as f64) as f32;
-        let (low, high) = (&self.phases[index], &self.phases[index + 1]);
-        let mut weights = [0.0; MOST_NEIGHBOURS];
-        for (weight, (low, high)) in weights.iter_mut().zip(low.iter().zip(high)) {
-            *weight = low + share * (high - low);
+        let first = whole as i64 - self.panel.reach as i64;
+        let end = first + self.phases[index].len() as i64;
+        let pixels = first.clamp(0, size as i64) as usize..end.clamp(0, size as i64) as usize;
+        let skip = (pixels.start as i64 - first) as usize;
+        Neighbours {
+            pixels,
+            low: &self.phases[index][skip.min(self.phases[index].len())..],
+            high: &self.phases[index + 1][skip.min(self.phases[index].len())..],
+            share: (phase - index as f64) as f32,
         }
-        (whole as i64 - self.panel.reach as i64, (weights, low.len()))
+    }
+}
+
+/// Pixels that exist, and their weights between two phases.
+struct Neighbours<'a> {
+    pixels: std::ops::Range<usize>,
+    low: &'a [f32],
+    high: &'a [f32],
+    share: f32,
+}
+
+impl Neighbours<'_> {
+    fn weights(&self) -> impl Iterator<Item = f32> {
+        self.low.iter().zip(self.high).map(|(low, high)| low + self.share * (high - low))
     }
 }
 
@@ -315,5 +330,131 @@ impl Illumination {
             light.iter_mut().zip(part).for_each(|(light, part)| *light += part);
         }
         light
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::sim::description::PanelPolarization;
+    use proptest::prelude::*;
+
+    fn description(size: [u32; 2], blur_px: f64, shift: [f64; 2]) -> ProjectorDescription {
+        ProjectorDescription {
+            size,
+            focal_px: 1000.0,
+            principal_point_px: None,
+            k1: 0.0,
+            k2: 0.0,
+            p1: 0.0,
+            p2: 0.0,
+            k3: 0.0,
+            blur_px,
+            polarization: [PanelPolarization::None; 3],
+            extinction: [1.0; 3],
+            response: [1.0; 3],
+            black_leak: 0.01,
+            gamma: 2.2,
+            panel_shift_px: [shift, [0.0, 0.0], [-0.3, 0.1]],
+            lcd_10_90_ms: 0.0,
+            latency_refreshes: 0,
+            refresh_hz: 60.0,
+            states_timing: true,
+        }
+    }
+
+    /// Light by brute force: each pixel's box and the normal distribution, integrated by the midpoint rule on a plane
+    /// that is infinite and dark outside, over the same of a picture at full drive.
+    fn oracle(panel: &Panel, light: impl Fn(usize, usize) -> f64, channel: usize, at: [f64; 2]) -> f64 {
+        let fine = 400;
+        let weight = |axis: usize, pixel: usize| {
+            let x = at[axis] - panel.shift_px[channel][axis] - pixel as f64;
+            let density = |d: f64| (-0.5 * (d / panel.blur_px).powi(2)).exp();
+            (0..fine).map(|step| density(x - (f64::from(step) + 0.5) / f64::from(fine) + 0.5)).sum::<f64>()
+                / f64::from(fine)
+                / (panel.blur_px * std::f64::consts::TAU.sqrt())
+        };
+        let (mut sum, mut total) = (0.0, 0.0);
+        let across: Vec<f64> = (0..panel.size[0]).map(|x| weight(0, x)).collect();
+        for y in 0..panel.size[1] {
+            let down = weight(1, y);
+            for (x, across) in across.iter().enumerate() {
+                sum += across * down * light(x, y);
+                total += across * down;
+            }
+        }
+        sum / total
+    }
+
+    fn code(x: usize, y: usize) -> Rgb {
+        let word = crate::sim::noise::mix((x * 31 + y) as u64);
+        [word as u8, (word >> 8) as u8 & 0x80, if word & 0x10000 == 0 { 0 } else { 255 }]
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(60))]
+        #[test]
+        fn tables_and_look_ups_agree_with_brute_force(
+            u in -1.0f64..24.0, v in -1.0f64..18.0, blur in 0.4f64..1.5, dx in -1.0f64..1.0,
+        ) {
+            let panel = Panel::new(&description([24, 18], blur, [dx, 0.4]));
+            let columns: Arc<[Rgb]> = (0..24).map(|x| code(x, 0)).collect();
+            let rows: Arc<[Rgb]> = (0..18).map(|y| code(3, y)).collect();
+            let full: Arc<[Rgb]> = (0..18).flat_map(|y| (0..24).map(move |x| code(x, y))).collect();
+            type Pick = fn(usize, usize) -> Rgb;
+            let cases: [(Slide, Pick); 4] = [
+                (Slide::Columns(columns), |x, _| code(x, 0)),
+                (Slide::Rows(rows), |_, y| code(3, y)),
+                (Slide::Full(full), code),
+                (Slide::Uniform([200, 0, 255]), |_, _| [200, 0, 255]),
+            ];
+            let position = [panel.position(0, u), panel.position(1, v)];
+            for (slide, pick) in cases {
+                let ours = panel.illuminate(&vec![(Arc::new(slide), 1.0)]).at(position[0], position[1]);
+                for channel in 0..3 {
+                    let light = |x, y| panel.light(pick(x, y)[channel]);
+                    let expected = oracle(&panel, light, channel, [u, v]);
+                    prop_assert!((f64::from(ours[channel]) - expected).abs() < 1e-4, "{} {expected}", ours[channel]);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn mixtures_are_sums() {
+        let panel = Panel::new(&description([24, 18], 0.6, [0.2, 0.0]));
+        let columns = Arc::new(Slide::Columns((0..24).map(|x| code(x, 0)).collect()));
+        let rows = Arc::new(Slide::Rows((0..18).map(|y| code(3, y)).collect()));
+        let uniform = Arc::new(Slide::Uniform([10, 255, 0]));
+        let mixture = vec![(columns.clone(), 0.5), (rows.clone(), 0.2), (uniform.clone(), 0.3)];
+        let (u, v) = (panel.position(0, 7.31), panel.position(1, 11.8));
+        let together = panel.illuminate(&mixture).at(u, v);
+        for channel in 0..3 {
+            let sum: f32 = mixture
+                .iter()
+                .map(|(slide, weight)| {
+                    *weight as f32 * panel.illuminate(&vec![(slide.clone(), 1.0)]).at(u, v)[channel]
+                })
+                .sum();
+            assert!((together[channel] - sum).abs() < 1e-6);
+        }
+    }
+
+    #[test]
+    fn boxes_add_up_and_borders_fall_off() {
+        for blur in [0.0, 0.3, 0.6, 2.0] {
+            let sum: f64 = (-30..=30).map(|pixel| blurred_box(0.37 - f64::from(pixel), blur)).sum();
+            assert!((sum - 1.0).abs() < 1e-12, "{blur}: {sum}");
+            let panel = Panel::new(&description([24, 18], blur, [0.0, 0.0]));
+            assert!((panel.coverage(1, [12.0, 9.0]) - 1.0).abs() < 1e-4);
+            assert!((panel.coverage(1, [-0.5, 9.0]) - 0.5).abs() < 1e-4);
+            assert!(panel.coverage(1, [-0.5 - 6.0 * blur - 0.01, 9.0]) < 1e-8);
+        }
+        // Full contrast without blur.
+        let panel = Panel::new(&description([4, 4], 0.0, [0.0, 0.0]));
+        let slide = Slide::Columns([[0; 3], [255; 3], [0; 3], [255; 3]].into());
+        let light = panel.illuminate(&vec![(Arc::new(slide), 1.0)]);
+        let at = |u| light.at(panel.position(0, u), panel.position(1, 1.0))[1];
+        assert!((at(0.45) - 0.01).abs() < 1e-6 && (at(0.55) - 1.0).abs() < 1e-6);
     }
 }

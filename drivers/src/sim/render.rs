@@ -177,8 +177,7 @@ fn kernel(blur_px: f64) -> Vec<f32> {
         return vec![1.0];
     }
     let reach = reach_px(blur_px) as i32;
-    let weights: Vec<f64> =
-        (-reach..=reach).map(|offset| blurred_box(f64::from(offset), blur_px)).collect();
+    let weights: Vec<f64> = (-reach..=reach).map(|offset| blurred_box(f64::from(offset), blur_px)).collect();
     let total: f64 = weights.iter().sum();
     weights.into_iter().map(|weight| (weight / total) as f32).collect()
 }
@@ -190,7 +189,8 @@ fn dot(gain: [f32; 3], light: Channels) -> f32 {
 /// Light of a row of views; the common kinds of slides have loops of their own.
 fn light_row(illumination: &Illumination, views: &[View], row: &mut [f32]) {
     let constant = illumination.constant;
-    let plus = |light: Channels| -> Channels { std::array::from_fn(|channel| light[channel] + constant[channel]) };
+    let plus =
+        |light: Channels| -> Channels { std::array::from_fn(|channel| light[channel] + constant[channel]) };
     let views = views.iter().zip(row);
     match (&illumination.columns, &illumination.rows, &illumination.full) {
         (None, None, None) => views.for_each(|(view, light)| *light = dot(view.gain, constant)),

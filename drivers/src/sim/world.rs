@@ -172,11 +172,8 @@ impl World {
             }
         }
         let light = light.unwrap_or(1.0);
-        let per_face: Vec<f32> = tracer
-            .primitives
-            .iter()
-            .map(|face| (factors[face.object].unwrap_or(light)) as f32)
-            .collect();
+        let per_face: Vec<f32> =
+            tracer.primitives.iter().map(|face| (factors[face.object].unwrap_or(light)) as f32).collect();
         self.views.par_iter_mut().zip(&self.sights).for_each(|(view, sight)| {
             if let Some(factor) = per_face.get(usize::from(sight.face)) {
                 view.gain.iter_mut().for_each(|gain| *gain *= factor);
@@ -208,10 +205,7 @@ impl World {
                 }
                 brightest
             })
-            .reduce(
-                || vec![0.0; objects],
-                |a, b| a.iter().zip(b).map(|(a, b)| a.max(b)).collect(),
-            )
+            .reduce(|| vec![0.0; objects], |a, b| a.iter().zip(b).map(|(a, b)| a.max(b)).collect())
     }
 }
 
@@ -231,8 +225,7 @@ impl<'a> Tracer<'a> {
             };
             (projector.response[channel], signed)
         });
-        let materials =
-            scene.objects.iter().map(|object| &scene.materials[&object.material]).collect();
+        let materials = scene.objects.iter().map(|object| &scene.materials[&object.material]).collect();
         Ok(Self {
             camera: camera_lens(description),
             projector: projector_lens(description),
@@ -270,8 +263,8 @@ impl<'a> Tracer<'a> {
             return dark;
         }
         // Each pixel of the panel sends the same flux, so that a screen parallel to the panel is evenly lit.
-        let irradiance =
-            UNIT_DISTANCE_MM * UNIT_DISTANCE_MM / (in_projector.normalize().z * in_projector.z * in_projector.z);
+        let irradiance = UNIT_DISTANCE_MM * UNIT_DISTANCE_MM
+            / (in_projector.normalize().z * in_projector.z * in_projector.z);
         let material = self.materials[primitive.object];
         let natural_and_polarized = self.reflect(material, normal, to_light, -ray);
         let grain = 1.0 - material.texture * self.texture(material, primitive, point);
