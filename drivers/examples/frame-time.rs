@@ -63,7 +63,12 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             times.push(1e3 * start.elapsed().as_secs_f64());
         }
         times.sort_by(f64::total_cmp);
-        println!("{name}: median {:.1} ms, worst {:.1} ms", times[times.len() / 2], times[times.len() - 1]);
+        println!(
+            "{name}: best {:.1} ms, median {:.1} ms, worst {:.1} ms",
+            times[0],
+            times[times.len() / 2],
+            times[times.len() - 1]
+        );
     }
     Ok(())
 }

@@ -224,12 +224,11 @@ impl Rig {
         };
         for y in rows {
             let start = (y + world.border) * world.width + world.border;
-            for view in &world.views[start + columns.start..start + columns.end.max(columns.start)] {
-                let [column, row] = if view.lit { view.at } else { [f32::NAN; 2] };
-                truth.column.push(column);
-                truth.row.push(row);
-                truth.depth_mm.push(view.depth_mm);
-                truth.object.push(view.face);
+            for sight in &world.sights[start + columns.start..start + columns.end.max(columns.start)] {
+                truth.column.push(sight.at[0]);
+                truth.row.push(sight.at[1]);
+                truth.depth_mm.push(sight.depth_mm);
+                truth.object.push(sight.face);
             }
         }
         truth

@@ -8,7 +8,7 @@ use super::{
     description::{PanelPolarization, RigDescription, middle_px},
     noise,
     optics::{Pinhole, Placement},
-    panel::{Channels, Panel, reach_px},
+    panel::{Panel, reach_px},
     polarization::{Analyser, Ray, across},
     rig::RigError,
     scene::{Material, Scene},
@@ -20,24 +20,37 @@ pub(crate) const NO_OBJECT: u8 = 255;
 /// Distance at which light fields are of order 1, in mm.
 const UNIT_DISTANCE_MM: f64 = 1000.0;
 
-/// What one pixel sees.
+/// What one pixel sees: what frames are rendered from.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct View {
-    /// Projector coordinate, NaN where the projector cannot see the point.
-    pub(crate) at: [f32; 2],
     /// Electrons at the reference exposure and full drive, per channel.
-    pub(crate) gain: Channels,
+    pub(crate) gain: [f32; 3],
+    /// [`Panel::position`] of the column and the row; meaningless without gain.
+    pub(crate) column: u32,
+    pub(crate) row: u32,
+}
+
+/// What one pixel sees: what nobody but the rig knows.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Sight {
+    /// Projector coordinate, NaN where the point is not lit by the picture.
+    pub(crate) at: [f32; 2],
     /// z in mm, NaN where nothing is seen.
     pub(crate) depth_mm: f32,
     /// Number of the face.
     pub(crate) face: u8,
-    /// Whether the point lies within the projected picture and in its light.
-    pub(crate) lit: bool,
 }
 
 impl View {
-    const NOTHING: Self =
-        Self { at: [f32::NAN; 2], gain: [0.0; 4], depth_mm: f32::NAN, face: NO_OBJECT, lit: false };
+    const DARK: Self = Self { gain: [0.0; 3], column: 0, row: 0 };
+}
+
+impl Sight {
+    const NOTHING: Self = Self { at: [f32::NAN; 2], depth_mm: f32::NAN, face: NO_OBJECT };
+
+    fn is_lit(&self) -> bool {
+        self.at[0].is_finite()
+    }
 }
 
 /// All views of a sensor with a border around it.
@@ -51,6 +64,8 @@ pub(crate) struct World {
     pub(crate) border: usize,
     /// Row-major.
     pub(crate) views: Vec<View>,
+    /// Row-major.
+    pub(crate) sights: Vec<Sight>,
     /// Names of the faces, and whether they are planar.
     pub(crate) faces: Vec<(String, bool)>,
 }
@@ -109,18 +124,20 @@ impl World {
         let tracer = Tracer::new(description, scene, panel)?;
         let border = if description.camera.blur_px > 0.0 { reach_px(description.camera.blur_px) } else { 0 };
         let [width, height] = description.camera.size.map(|side| side as usize + 2 * border);
-        let mut views = vec![View::NOTHING; width * height];
-        views.par_chunks_mut(width).enumerate().try_for_each(|(y, row)| {
-            for (x, view) in row.iter_mut().enumerate() {
+        let mut views = vec![View::DARK; width * height];
+        let mut sights = vec![Sight::NOTHING; width * height];
+        let rows = views.par_chunks_mut(width).zip(sights.par_chunks_mut(width));
+        rows.enumerate().try_for_each(|(y, (views, sights))| {
+            for (x, (view, sight)) in views.iter_mut().zip(sights).enumerate() {
                 let pixel = [x as f64 - border as f64, y as f64 - border as f64];
                 let ray = tracer.camera.ray(pixel).ok_or(RigError::Lens { which: "camera" })?;
-                *view = tracer.view(ray);
+                (*view, *sight) = tracer.look(ray);
             }
             Ok(())
         })?;
         let faces =
             tracer.primitives.iter().map(|face| (face.name.clone(), face.shape.is_planar())).collect();
-        let mut world = Self { width, height, border, views, faces };
+        let mut world = Self { width, height, border, views, sights, faces };
         world.set_levels(description, scene, &tracer)?;
         Ok(world)
     }
@@ -157,8 +174,8 @@ impl World {
         let light = light.unwrap_or(1.0);
         let per_face: Vec<f32> =
             tracer.primitives.iter().map(|face| (factors[face.object].unwrap_or(light)) as f32).collect();
-        self.views.par_iter_mut().for_each(|view| {
-            if let Some(factor) = per_face.get(usize::from(view.face)) {
+        self.views.par_iter_mut().zip(&self.sights).for_each(|(view, sight)| {
+            if let Some(factor) = per_face.get(usize::from(sight.face)) {
                 view.gain.iter_mut().for_each(|gain| *gain *= factor);
             }
         });
@@ -177,9 +194,10 @@ impl World {
         rows.into_par_iter()
             .map(|y| {
                 let mut brightest = vec![0.0f64; objects];
-                for view in &self.views[y * self.width + self.border..(y + 1) * self.width - self.border] {
-                    if view.lit {
-                        let object = tracer.primitives[usize::from(view.face)].object;
+                let row = y * self.width + self.border..(y + 1) * self.width - self.border;
+                for (view, sight) in self.views[row.clone()].iter().zip(&self.sights[row]) {
+                    if sight.is_lit() {
+                        let object = tracer.primitives[usize::from(sight.face)].object;
                         let seen: f64 =
                             drive.iter().zip(view.gain).map(|(drive, gain)| drive * f64::from(gain)).sum();
                         brightest[object] = brightest[object].max(seen);
@@ -224,12 +242,12 @@ impl<'a> Tracer<'a> {
     }
 
     /// What is seen along a ray of the camera.
-    fn view(&self, ray: Vector3<f64>) -> View {
+    fn look(&self, ray: Vector3<f64>) -> (View, Sight) {
         let Some((face, distance)) = nearest(&self.primitives, Vector3::zeros(), ray) else {
-            return View::NOTHING;
+            return (View::DARK, Sight::NOTHING);
         };
         let point = ray * distance;
-        let dark = View { depth_mm: point.z as f32, face: face as u8, ..View::NOTHING };
+        let dark = (View::DARK, Sight { depth_mm: point.z as f32, face: face as u8, ..Sight::NOTHING });
         let primitive = &self.primitives[face];
         let normal = primitive.shape.normal_against(point, ray);
         let to_light = (self.placement.centre_mm - point).normalize();
@@ -251,14 +269,15 @@ impl<'a> Tracer<'a> {
         let natural_and_polarized = self.reflect(material, normal, to_light, -ray);
         let grain = 1.0 - material.texture * self.texture(material, primitive, point);
         let strength = irradiance * primitive.reflectance * grain;
-        let mut gain = [0.0f32; 4];
-        for channel in 0..3 {
+        let gain = std::array::from_fn(|channel| {
             let (light, degree) = self.channels[channel];
             let seen = natural_and_polarized[0] + degree * natural_and_polarized[1];
-            gain[channel] = (strength * light * material.tint[channel] * coverage[channel] * seen) as f32;
-        }
-        let lit = (0..2).all(|axis| at[axis] >= -0.5 && at[axis] < self.size[axis] - 0.5);
-        View { at: at.map(|value| value as f32), gain, lit, ..dark }
+            (strength * light * material.tint[channel] * coverage[channel] * seen) as f32
+        });
+        let within = (0..2).all(|axis| at[axis] >= -0.5 && at[axis] < self.size[axis] - 0.5);
+        let [column, row] = [0, 1].map(|axis| self.panel.position(axis, at[axis]));
+        let at = if within { at.map(|value| value as f32) } else { [f32::NAN; 2] };
+        (View { gain, column, row }, Sight { at, ..dark.1 })
     }
 
     fn texture(&self, material: &Material, primitive: &Primitive, point: Vector3<f64>) -> f64 {
