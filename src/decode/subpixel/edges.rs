@@ -290,11 +290,25 @@ impl<'a, T: Sample> EdgeFinder<'a, T> {
     }
 }
 
-/// Crossing of the straight line between two pixels.
+/// Crossing between two pixels: straight line through the two fringes, each stretched as the profile of a blurred
+/// edge asks for. An isolated edge of height +-1 is `a = 2 Phi(t) - 1`; `t(a)` makes it straight, and the width of the
+/// blur cancels. Where neighbouring stripes weaken the fringe, `a` is small and `t` as good as linear.
 fn two_point(position: usize, (a, of_a): (f64, f64), (b, of_b): (f64, f64)) -> (f64, f64) {
+    let ((a, per_a), (b, per_b)) = (straightened(a), straightened(b));
     let slope = a - b;
-    let variance = (b * b * of_a + a * a * of_b) / slope.powi(4);
+    let variance = (b * b * of_a * per_a * per_a + a * a * of_b * per_b * per_b) / slope.powi(4);
     (position as f64 + a / slope, variance)
+}
+
+/// Quantile of the normal distribution at `(1 + a) / 2` up to a constant factor, and its derivative: its series to
+/// a^7, with a last term that holds it within 1 % up to 0.9. Beyond 0.95 noise decides and `a` is held.
+fn straightened(a: f64) -> (f64, f64) {
+    const C: [f64; 4] = [0.2618, 0.1439, 0.0977, 0.232];
+    let a = a.clamp(-0.95, 0.95);
+    let s = a * a;
+    let value = a * (1.0 + s * (C[0] + s * (C[1] + s * (C[2] + s * C[3]))));
+    let slope = 1.0 + s * (3.0 * C[0] + s * (5.0 * C[1] + s * (7.0 * C[2] + s * 9.0 * C[3])));
+    (value, slope)
 }
 
 /// Joins what noise has multiplied: the crossings of one boundary in a row count as one, `x1 - x2 + x3`, or as none
