@@ -32,6 +32,10 @@ const SAMPLED_LINES: usize = 120;
 /// asymmetry of blurred fine stripes; an edge pixel may carry either of two codes.
 const MAX_OFF_CODE: f64 = 1.0;
 const MAX_OFF_EDGE: f64 = 1.5;
+/// Variance of a code by itself in px^2 (uniform over one px; an edge pixel may carry the code on either side of the
+/// boundary). A fit that knows no better is not used.
+const CODE_VARIANCE: f64 = 1.0 / 12.0;
+const EDGE_CODE_VARIANCE: f64 = 1.0 / 12.0 + 1.0 / 4.0;
 /// A pixel counts as measured at an edge up to this far from one, in px.
 const AT_EDGE: f64 = 1.0;
 
@@ -133,8 +137,13 @@ fn fill_codes<T: Sample>(finder: &EdgeFinder<'_, T>, line: Line, (coordinate, si
     for position in 0..line.len {
         if let Some((first, last)) = finder.value(line.at(position)).and_then(|value| finder.code.span(value))
         {
+            let of_code = if finder.class(line.at(position)) == Class::Edge {
+                EDGE_CODE_VARIANCE
+            } else {
+                CODE_VARIANCE
+            };
             coordinate[position] = (first + last) as f32 / 2.0;
-            sigma[position] = (last - first + 1) as f32 / 12f32.sqrt();
+            sigma[position] = (f64::from(last - first + 1) * of_code.sqrt()) as f32;
         }
     }
 }
@@ -165,12 +174,15 @@ fn fill_fits<T: Sample>(
                 known = passed;
             }
             let centre = finder.code.boundary(value) - 0.5;
-            let limit = if finder.class(at) == Class::Edge { MAX_OFF_EDGE } else { MAX_OFF_CODE };
+            let (limit, of_code) = match finder.class(at) {
+                Class::Edge => (MAX_OFF_EDGE, EDGE_CODE_VARIANCE),
+                _ => (MAX_OFF_CODE, CODE_VARIANCE),
+            };
             let best = fits
                 .iter()
                 .flatten()
                 .map(|fit| fit.at(position as f64))
-                .filter(|(u, variance)| (u - centre).abs() <= limit && variance.is_finite())
+                .filter(|&(u, variance)| (u - centre).abs() <= limit && variance > 0.0 && variance < of_code)
                 .min_by(|a, b| (a.0 - centre).abs().total_cmp(&(b.0 - centre).abs()));
             let Some((u, variance)) = best else { continue };
             let near =

@@ -26,16 +26,73 @@ fn report(name: &str, a: super::synth::Accuracy) {
     );
 }
 
+/// A sphere of 40 mm on the paper's rig (`bump` 1), or one whose depth counts `bump` times.
+fn sphere(reflectance: f64, bump: f64) -> impl Fn(f64, f64) -> Spot + Sync {
+    move |x, y| {
+        let r2 = (x - 200.0).powi(2) + (y - 48.0).powi(2);
+        let depth = (40.0f64.powi(2) - r2 * 0.2156 * 0.2156).max(0.0).sqrt();
+        let inside = depth > 10.0;
+        Spot {
+            u: 300.0 + 0.331 * x - bump * depth / 12.0,
+            v: 200.0 + 0.331 * y,
+            reflectance: if inside { reflectance } else { 0.0 },
+            surface: u32::from(inside),
+            ..Spot::default()
+        }
+    }
+}
+
+/// Two slanted planes side by side, the right one `jump` columns further, along a border that leans by `lean`.
+fn step(reflectance: f64, jump: f64, lean: f64) -> impl Fn(f64, f64) -> Spot + Sync {
+    move |x, y| {
+        let right = x > 160.3 + lean * (y - 48.0);
+        Spot {
+            u: 300.2 + 0.331 * x + 0.011 * y + if right { jump } else { 0.0 },
+            v: 200.4 + 0.333 * y - 0.008 * x,
+            reflectance,
+            surface: u32::from(right),
+            ..Spot::default()
+        }
+    }
+}
+
+/// Classes of the pixels of an image.
+fn classes(decoded: &crate::decode::Decoded) -> String {
+    use crate::decode::Class;
+    Class::ALL
+        .iter()
+        .map(|class| (class, decoded.class.data().iter().filter(|c| *c == class).count()))
+        .filter(|(_, count)| *count > 0)
+        .map(|(class, count)| format!("{class:?} {count} "))
+        .collect()
+}
+
 #[test]
 fn probe() {
-    for slope in [0.331, 0.25, 0.21, 0.47, 0.7, 1.0] {
-        for blur_px in [1.9, 1.2, 0.8, 0.6, 0.5, 0.4, 0.3, 0.05] {
-            for reflectance in [1.0, 0.1, 0.03] {
-                let rig = Rig { blur_px, ..Rig::default() };
-                let scene = slanted(reflectance, slope);
-                let decoded = rig.decode(&scene, &sequence(Mode::Fast));
-                let name = format!("{slope} blur {blur_px} at {reflectance}");
-                report(&name, accuracy(&rig, &scene, &decoded, Axis::Column, |_, _| true));
+    for reflectance in [1.0, 0.1, 0.03] {
+        for bump in [1.0, 3.0, 10.0] {
+            let rig = Rig { width: 400, ..Rig::default() };
+            let scene = sphere(reflectance, bump);
+            let decoded = rig.decode(&scene, &sequence(Mode::Pse));
+            report(
+                &format!("sphere {bump} at {reflectance}"),
+                accuracy(&rig, &scene, &decoded, Axis::Column, |_, _| true),
+            );
+            println!("      {}", classes(&decoded));
+        }
+        for jump in [0.3, 0.5, 0.8, 1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 20.0, -20.0, 63.0, 100.3] {
+            for lean in [0.0, 0.5] {
+                let rig = Rig::default();
+                let scene = step(reflectance, jump, lean);
+                let decoded = rig.decode(&scene, &sequence(Mode::Pse));
+                report(
+                    &format!("jump {jump} lean {lean} at {reflectance}"),
+                    accuracy(&rig, &scene, &decoded, Axis::Column, |x, y| {
+                        let border = 160.3 + lean * (y as f64 - 48.0);
+                        (x as f64 - border).abs() < 12.0
+                    }),
+                );
+                println!("      {}", classes(&decoded));
             }
         }
     }
