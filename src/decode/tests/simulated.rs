@@ -80,7 +80,7 @@ fn probe() {
             );
             println!("      {}", classes(&decoded));
         }
-        for jump in [0.3, 0.5, 0.8, 1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 20.0, -20.0, 63.0, 100.3] {
+        for jump in [0.0, 0.3, 1.0, 2.0, 3.0, 20.0] {
             for lean in [0.0, 0.5] {
                 let rig = Rig::default();
                 let scene = step(reflectance, jump, lean);
