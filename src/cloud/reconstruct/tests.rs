@@ -6,7 +6,7 @@ use nalgebra::{Matrix3, Vector3};
 
 use super::*;
 use crate::{
-    cloud::fit_plane,
+    cloud::{CloudFrame, fit_plane, write_ply},
     decode::NoiseModel,
     geometry::{
         Lens, Pose, Projector, ReadHints,
@@ -486,4 +486,33 @@ fn captured_vertical_baseline() {
         median(&mut sigma)
     };
     assert!(sigma(&alone) > 5.0 * sigma(&result), "{} {}", sigma(&alone), sigma(&result));
+}
+
+/// Writes a cloud of a full frame to the folder named in POLSCAN_PLY_OUT, for readers that are not ours
+/// (tests/python/check_ply.py), and prints how long each step takes.
+#[test]
+#[ignore = "writes a file and measures: run with --ignored and POLSCAN_PLY_OUT"]
+fn full_frame_timings_and_file() {
+    let calibration = rig(1.0);
+    let scene = sphere([0.0, 0.0, 1100.0], 140.0);
+    let back = plane([0.05, 0.02, -1.0], 1000.0);
+    let (decoded, _) = decode(&calibration, &move |ray| scene(ray).or_else(|| back(ray)), true);
+    let settings = ReconstructSettings::new(VOLUME.0, VOLUME.1);
+    let clock = std::time::Instant::now();
+    let triangulator = Triangulator::new(&calibration).unwrap();
+    let prepared = clock.elapsed();
+    for _ in 0..3 {
+        let clock = std::time::Instant::now();
+        let result = reconstruct_with(&triangulator, &decoded, &settings).unwrap();
+        let done = clock.elapsed();
+        let mut bytes = Vec::new();
+        let points = write_ply(&mut bytes, &result.cloud, &decoded.intensity, CloudFrame::Camera).unwrap();
+        eprintln!(
+            "prepare {prepared:?}, reconstruct {done:?}, write {:?}, {points} points",
+            clock.elapsed() - done
+        );
+        if let Some(folder) = std::env::var_os("POLSCAN_PLY_OUT") {
+            std::fs::write(Path::new(&folder).join("cloud.ply"), &bytes).unwrap();
+        }
+    }
 }
