@@ -211,6 +211,7 @@ pub struct Machine {
     discarded: Vec<Finding>,
     flips: Flips,
     exposures: Exposures,
+    exposed: Timestamp,
 }
 
 impl Machine {
@@ -232,6 +233,7 @@ impl Machine {
             discarded: Vec::new(),
             flips: Flips::default(),
             exposures: Exposures::new(triggered),
+            exposed: Timestamp(0),
         }
     }
 
@@ -305,7 +307,7 @@ impl Machine {
     fn show(&mut self, now: Timestamp, group: usize, step: usize) -> Action {
         self.current = Some((group, step));
         let due = self.flips.last().map(|receipt| self.timing.next_show(self.timing.latest_flip(receipt)));
-        let not_before = due.unwrap_or(now).max(now);
+        let not_before = due.unwrap_or(now).max(now).max(self.exposed);
         self.phase = Phase::Showing { asked: not_before };
         Action::Show { step, not_before }
     }
@@ -344,6 +346,7 @@ impl Machine {
 
     fn triggered(&mut self, at: Timestamp, started: Timestamp) -> Vec<Action> {
         self.exposures.trigger();
+        self.exposed = at.max(started) + self.timing.exposure;
         let deadline = self.timing.frame_deadline(at.max(started));
         self.phase =
             Phase::Awaiting(Wait { window: Window { at, started }, deadline, discarded: 0, last: None });
