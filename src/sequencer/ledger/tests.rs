@@ -58,6 +58,14 @@ fn receipts_must_answer_the_slide_and_the_time_that_were_asked_for() {
 }
 
 #[test]
+fn the_flip_of_a_wrong_slide_cannot_be_claimed_again() {
+    let mut flips = Flips::default();
+    assert_eq!(enter(&mut flips, receipt(2, 14), 13), Some("wrong-slide"));
+    assert_eq!(enter(&mut flips, receipt(3, 14), 14), Some("stale-receipt"));
+    assert_eq!(enter(&mut flips, receipt(3, 15), 14), None);
+}
+
+#[test]
 fn a_refresh_rate_a_little_off_its_nominal_value_is_no_lie() {
     let mut flips = Flips::default();
     assert_eq!(enter(&mut flips, receipt(3, 0), 0), None);
