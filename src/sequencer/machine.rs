@@ -46,6 +46,9 @@ pub use types::{Action, Device, Diagnosis, Event, GroupRetake, Outcome, Subject}
 /// Frames that may be discarded while one is awaited.
 pub const MAX_DISCARDED: u32 = 8;
 
+/// Refused pairs, with none accepted, that put the references they were judged against in doubt.
+const DOUBTFUL_REFERENCES: u32 = 2;
+
 #[derive(Debug, Clone, PartialEq)]
 enum Phase {
     Idle,
@@ -85,6 +88,10 @@ pub struct Machine {
     flips: Flips,
     exposures: Exposures,
     exposed: Timestamp,
+    /// Whether a pair has agreed with the references.
+    references_hold: bool,
+    refused_pairs: u32,
+    references_repeated: bool,
 }
 
 impl Machine {
@@ -107,6 +114,9 @@ impl Machine {
             flips: Flips::default(),
             exposures: Exposures::new(triggered),
             exposed: Timestamp(0),
+            references_hold: false,
+            refused_pairs: 0,
+            references_repeated: false,
         }
     }
 
@@ -304,6 +314,8 @@ impl Machine {
             evidence: suspicion.evidence,
             sigma: Some(suspicion.sigma),
         };
+        let refused = matches!(verdict, PairVerdict::Retake(_));
+        self.references_hold |= matches!(subject, Subject::Pair { .. }) && !refused;
         let mut actions = match verdict {
             PairVerdict::Accept => vec![Action::Accept { group }],
             PairVerdict::Degraded(suspicion) => {
@@ -311,8 +323,7 @@ impl Machine {
                 vec![Action::Accept { group }]
             }
             PairVerdict::Retake(suspicion) if self.may_repeat(group) => {
-                self.queue.push_front(group);
-                vec![self.enter_retake(group, suspicion.reason, suspicion.evidence)]
+                self.repeat_judged(subject, suspicion)
             }
             // What has changed since the first references stays changed: the scan says so and stands.
             PairVerdict::Retake(suspicion) if matches!(subject, Subject::Drift { .. }) => {
@@ -334,6 +345,33 @@ impl Machine {
             Phase::Shown { flip } => actions.push(self.expose(now, flip)),
             Phase::Judging => actions.extend(self.advance(now)),
             phase => self.phase = phase,
+        }
+        actions
+    }
+
+    /// Takes what was judged again, when the group under way is complete; the first references too where no pair
+    /// so far agrees with them.
+    fn repeat_judged(&mut self, subject: Subject, suspicion: Suspicion) -> Vec<Action> {
+        let group = subject.group();
+        let mut actions = vec![self.enter_retake(group, suspicion.reason.clone(), suspicion.evidence)];
+        let is_reference = |machine: &Self, group: usize| {
+            let role = machine.roles[machine.groups[group].steps().start];
+            matches!(machine.groups[group], Group::Single { .. }) && !matches!(role, Role::Code { .. })
+        };
+        // Behind references that are to be repeated: it is judged against them.
+        let place = self.queue.iter().take_while(|&&queued| is_reference(self, queued)).count();
+        self.queue.insert(place, group);
+        self.refused_pairs += u32::from(matches!(subject, Subject::Pair { .. }));
+        if self.refused_pairs < DOUBTFUL_REFERENCES || self.references_hold || self.references_repeated {
+            return actions;
+        }
+        self.references_repeated = true;
+        for reference in (0..self.groups.len()).rev() {
+            if is_reference(self, reference) && self.may_repeat(reference) {
+                self.queue.push_front(reference);
+                let evidence = format!("the first {} pairs do not agree with it", self.refused_pairs);
+                actions.push(self.enter_retake(reference, suspicion.reason.clone(), evidence));
+            }
         }
         actions
     }

@@ -53,6 +53,8 @@ enum Fault {
     NoArm,
     /// Show `n` presents slide `m`, as its receipt says.
     WrongSlide(u64, u32),
+    /// Show `n` presents slide `m`, and its receipt does not admit it.
+    Lie(u64, u32),
     /// Show `n` flips nothing and returns the receipt of the flip before, under the new slide's name.
     FalseReceipt(u64),
     /// Show `n` flips so many refreshes late, honestly.
@@ -183,6 +185,13 @@ impl Projector for Panel {
             Fault::LateFlip(n, refreshes) if n == show => Some(refreshes),
             _ => None,
         });
+        let lie = self.world.find(|fault| match fault {
+            Fault::Lie(n, slide) if n == show => Some(slide),
+            _ => None,
+        });
+        if let Some(slide) = lie {
+            return Ok(PresentReceipt { slide: Some(index), ..self.flip(Some(slide), 0) });
+        }
         Ok(self.flip(Some(shown.unwrap_or(index)), late.unwrap_or(0)))
     }
 
@@ -340,30 +349,43 @@ fn applied() -> AppliedSettings {
     }
 }
 
-/// Answers the judgements in turn, then accepts; and checks what it is shown.
+/// Answers the judgements in turn; after that, judges by the slides that the frames show, as the pair sum would.
 #[derive(Default)]
 struct Script {
     pairs: VecDeque<PairVerdict>,
     drifts: VecDeque<PairVerdict>,
-    references: Vec<Role>,
+    references: Vec<(Role, u16)>,
     judged: Vec<(Axis, u8, [u16; 2])>,
     panics: bool,
 }
 
+impl Script {
+    fn reference_of(&self, role: Role) -> Option<u16> {
+        self.references.iter().rev().find(|reference| reference.0 == role).map(|reference| reference.1)
+    }
+}
+
 impl Judge for Script {
-    fn reference(&mut self, role: Role, _: &Frame) {
-        self.references.push(role);
+    fn reference(&mut self, role: Role, frame: &Frame) {
+        self.references.push((role, value(frame)));
     }
 
     fn pair(&mut self, axis: Axis, bit: u8, frame: &Frame, inverse: &Frame) -> PairVerdict {
         assert!(!self.panics, "the judge panics");
-        assert!(!self.references.is_empty(), "references come first");
         self.judged.push((axis, bit, [frame, inverse].map(value)));
-        self.pairs.pop_front().unwrap_or(PairVerdict::Accept)
+        let references = [Role::ReferenceV, Role::ReferenceH].map(|role| self.reference_of(role));
+        let step = sequence().roles.iter().position(|&role| role == Role::Code { axis, bit, inverse: false });
+        let step = step.expect("a bit of the sequence") as u16;
+        let agree = references == [Some(0), Some(1)] && [frame, inverse].map(value) == [step, step + 1];
+        let own = if agree { PairVerdict::Accept } else { suspicious("stale-frame") };
+        self.pairs.pop_front().unwrap_or(own)
     }
 
-    fn drift(&mut self, _: Role, _: &Frame, _: &Frame) -> PairVerdict {
-        self.drifts.pop_front().unwrap_or(PairVerdict::Accept)
+    fn drift(&mut self, role: Role, first: &Frame, last: &Frame) -> PairVerdict {
+        let expected = if role == Role::ReferenceV { [0, 12] } else { [1, 13] };
+        let agree = [first, last].map(value) == expected;
+        let own = if agree { PairVerdict::Accept } else { suspicious("stale-frame") };
+        self.drifts.pop_front().unwrap_or(own)
     }
 }
 
@@ -490,7 +512,9 @@ fn run_judged(faults: &[Fault], mut judge: Script) -> Run {
 fn run(faults: &[Fault]) -> Run {
     let run = run_judged(faults, Script::default());
     assert_eq!(run.disarmed, 1, "disarmed once");
-    if let Ok(record) = &run.result {
+    if let Ok(record) = run.result.as_ref()
+        && !run.findings().contains(&"stale-frame")
+    {
         assert_proven(record);
     }
     run
@@ -643,6 +667,26 @@ fn receipts_that_do_not_hold_are_not_believed() {
 }
 
 #[test]
+fn a_projector_that_lies_about_a_pair_is_caught_by_the_judge() {
+    let run = run(&[Fault::Lie(4, 2)]);
+    assert_eq!(run.retakes(), [("column 1".into(), "stale-frame", 1)]);
+}
+
+#[test]
+fn a_projector_that_lies_about_a_reference_is_caught_by_the_pairs() {
+    for (show, slide) in [(0, 1), (1, 0)] {
+        let run = run(&[Fault::Lie(show, slide)]);
+        let again: Vec<Role> =
+            run.record().notes.references_retaken.iter().map(|retake| retake.role).collect();
+        assert_eq!(again, [Role::ReferenceH, Role::ReferenceV]);
+        let pairs: Vec<String> = run.retakes().into_iter().map(|retake| retake.0).collect();
+        assert_eq!(pairs, ["column 0", "column 1", "column 0"]);
+    }
+    let last = run(&[Fault::Lie(13, 12)]);
+    assert_eq!(last.record().notes.references_retaken[0].role, Role::ReferenceH);
+}
+
+#[test]
 fn a_late_flip_is_followed() {
     let run = run(&[Fault::LateFlip(5, 3)]);
     assert!(run.record().retaken.is_empty());
@@ -786,6 +830,7 @@ fn any_fault() -> impl Strategy<Value = Fault> {
         (0u64..20, ms(0..60)).prop_map(|(n, early)| Fault::Early(n, early)),
         (0u64..20, 0u32..14).prop_map(|(n, slide)| Fault::WrongSlide(n, slide)),
         (0u64..20).prop_map(Fault::FalseReceipt),
+        (0u64..20, 0u32..14).prop_map(|(n, slide)| Fault::Lie(n, slide)),
         (0u64..20, 0u64..6).prop_map(|(n, late)| Fault::LateFlip(n, late)),
         (0u64..20).prop_map(Fault::MissedFlip),
         (0u64..60).prop_map(Fault::CameraGone),

@@ -283,6 +283,34 @@ fn a_suspicious_pair_is_repeated_after_the_one_under_way() {
 }
 
 #[test]
+fn references_that_no_pair_agrees_with_are_repeated() {
+    let mut story = Story::begin(Mode::Pse);
+    let refuse = |story: &mut Story, group: usize| {
+        story.until(|action| *action == Action::Judge(Subject::Pair { group }));
+        story.tell(Event::Judged(Subject::Pair { group }, suspicious("torn-frame")));
+    };
+    refuse(&mut story, 2);
+    refuse(&mut story, 3);
+    // Pair 2 was under way for the second time, against the old references.
+    refuse(&mut story, 2);
+    assert_eq!(story.outcome(), Outcome::Complete);
+    assert_eq!(story.shown(), [0, 1, 2, 3, 4, 5, 2, 3, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9]);
+    let groups: Vec<usize> = story.retakes().iter().map(|retake| retake.0).collect();
+    assert_eq!(groups, [2, 3, 1, 0, 2]);
+}
+
+#[test]
+fn references_that_a_pair_agreed_with_are_not_doubted() {
+    let mut story = Story::begin(Mode::Pse);
+    for group in [3, 4] {
+        story.until(|action| *action == Action::Judge(Subject::Pair { group }));
+        story.tell(Event::Judged(Subject::Pair { group }, suspicious("motion")));
+    }
+    assert_eq!(story.outcome(), Outcome::Complete);
+    assert_eq!(story.retakes().len(), 2);
+}
+
+#[test]
 fn the_last_pair_is_repeated_before_the_scan_completes() {
     let mut story = Story::begin(Mode::Paper);
     story.until(|action| *action == Action::Judge(Subject::Pair { group: 3 }));
