@@ -307,3 +307,321 @@ impl Timings {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+    use serde_json::Value;
+
+    use super::*;
+    use crate::report::{Diagnosis, Verdict, testing};
+
+    /// Keys of the contract, by object.
+    const KEYS: &[(&str, &[&str])] = &[
+        (
+            "",
+            &[
+                "schema",
+                "mode",
+                "frames",
+                "size",
+                "verdict",
+                "reasons",
+                "pixels",
+                "capture",
+                "contrast",
+                "planes",
+                "truth",
+                "timings_ms",
+                "threads",
+            ],
+        ),
+        ("/size", &["width", "height"]),
+        (
+            "/pixels",
+            &[
+                "total",
+                "lit",
+                "valid",
+                "edge",
+                "saturated",
+                "unlit",
+                "inverted",
+                "ambiguous",
+                "rejected_by_row",
+            ],
+        ),
+        (
+            "/capture",
+            &[
+                "seconds",
+                "limit_seconds",
+                "latency_ms",
+                "hold_frames",
+                "retaken",
+                "pair_residual_sigma",
+                "drift",
+            ],
+        ),
+        ("/capture/pair_residual_sigma", &["median", "worst", "worst_pair", "per_pair"]),
+        ("/contrast", &["raw", "dolp", "ratio", "raw_lit", "dolp_lit", "ratio_lit"]),
+        ("/planes/0", &["name", "points", "coverage", "rmse_mm", "bow_mm", "p95_mm"]),
+        (
+            "/truth",
+            &[
+                "coverage",
+                "wrong_code_rate",
+                "wrong_code_rate_before_gates",
+                "column_rms_px",
+                "depth_rmse_mm",
+                "sigma_z_ratio",
+                "border",
+            ],
+        ),
+        ("/truth/border", &["pixels", "wrong"]),
+        ("/timings_ms", &["load", "decode", "subpixel", "triangulate", "write", "after_last_frame"]),
+    ];
+
+    fn capture() -> CaptureSummary {
+        CaptureSummary {
+            seconds: 1.5,
+            limit_seconds: 1.47,
+            latency_ms: 33.0,
+            hold_frames: 2,
+            timing_measured: true,
+            ..Default::default()
+        }
+    }
+
+    #[test]
+    fn a_sound_scan_is_ok_and_has_every_key_of_the_contract() {
+        let decoded = testing::decoded(160, 120);
+        let (truth, made, capture) = (testing::truth(&decoded), testing::reconstruction(&decoded), capture());
+        let settings = testing::settings(160, 120);
+        let report = build(&ReportInput {
+            settings: Some(&settings),
+            reconstruction: Some(&made),
+            truth: Some(&truth),
+            capture: Some(&capture),
+            contrast: Some(Contrast::new(100.0, 500.0, 120.0, 480.0)),
+            timings: Timings {
+                load: Some(1.0),
+                decode: Some(2.0),
+                subpixel: Some(3.0),
+                triangulate: Some(4.0),
+                write: Some(5.0),
+                after_last_frame: Some(6.0),
+            },
+            ..testing::input(&decoded)
+        });
+        assert_eq!((report.verdict, &report.reasons[..]), (Verdict::Ok, &[][..]));
+        let json = serde_json::to_value(&report).unwrap();
+        for (object, keys) in KEYS {
+            for key in *keys {
+                let value = json.pointer(object).unwrap_or_else(|| panic!("{object}")).get(key);
+                assert!(value.is_some_and(|value| !value.is_null()), "{object}/{key}");
+            }
+        }
+        assert_eq!(json["schema"], "polscan.report/1");
+        assert_eq!(json["mode"], "pse");
+        assert_eq!(json["contrast"]["ratio"], 5.0);
+        assert_eq!(json["capture"]["hold_frames"], 2);
+        assert_eq!(json["capture"]["pair_residual_sigma"]["worst_pair"]["axis"], "row");
+        assert_eq!(serde_json::from_value::<Report>(json).unwrap(), report);
+    }
+
+    #[test]
+    fn without_anything_each_key_is_there_and_null() {
+        let report = build(&ReportInput::new(Mode::Fast, Size { width: 4, height: 3 }, 0));
+        let json = serde_json::to_value(&report).unwrap();
+        for key in KEYS[0].1 {
+            assert!(json.get(key).is_some(), "{key}");
+        }
+        for pointer in [
+            "/pixels",
+            "/points",
+            "/truth",
+            "/contrast",
+            "/noise",
+            "/row_check",
+            "/calibration",
+            "/capture/seconds",
+            "/capture/drift",
+            "/capture/pair_residual_sigma",
+            "/timings_ms/load",
+        ] {
+            assert_eq!(json.pointer(pointer), Some(&Value::Null), "{pointer}");
+        }
+        assert_eq!(json["planes"], serde_json::json!([]));
+        assert_eq!(serde_json::from_value::<Report>(json).unwrap(), report);
+    }
+
+    #[test]
+    fn no_number_is_left_that_json_has_no_word_for() {
+        let mut decoded = testing::decoded(40, 30);
+        for pair in &mut decoded.pairs {
+            (pair.flat_outliers, pair.median) = (f64::NAN, f64::INFINITY);
+        }
+        decoded.drift = Some(f64::NAN);
+        decoded.dolp.data_mut().fill(f32::NAN);
+        let mut made = testing::reconstruction(&decoded);
+        made.cloud.point_mm.data_mut()[5] = [f32::NAN; 3];
+        made.row_check.as_mut().unwrap().median_px = f64::NAN;
+        let timings = Timings { load: Some(f64::NAN), decode: Some(3.0), ..Timings::default() };
+        let contrast = Some(Contrast::new(0.0, 0.0, f64::NAN, 3.0));
+        let report = build(&ReportInput {
+            reconstruction: Some(&made),
+            timings,
+            contrast,
+            ..testing::input(&decoded)
+        });
+        // What survives the way through JSON held nothing that became `null` on it.
+        let json = serde_json::to_string(&report).unwrap();
+        assert_eq!(serde_json::from_str::<Report>(&json).unwrap(), report);
+        assert_eq!((report.timings_ms.load, report.timings_ms.decode), (None, Some(3.0)));
+        assert_eq!(report.points, Some(40 * 30 - 1));
+    }
+
+    #[test]
+    fn what_the_capture_found_is_in_the_report() {
+        let found = [Reason::failed(Diagnosis::TornFrame, "torn", Value::Null)];
+        let input =
+            ReportInput { found: &found, ..ReportInput::new(Mode::Pse, Size { width: 4, height: 3 }, 7) };
+        let report = build(&input);
+        assert_eq!((report.verdict, &report.reasons[..], report.frames), (Verdict::Failed, &found[..], 7));
+    }
+
+    #[test]
+    fn classes_are_counted_after_all_gates() {
+        let mut decoded = testing::decoded(12, 1);
+        decoded.class = Grid::from_vec(12, 1, Class::ALL.to_vec());
+        decoded.half_saturated.data_mut()[3] = true;
+        let mut made = testing::reconstruction(&decoded);
+        made.class.data_mut()[1] = Class::RowGate;
+        let counts =
+            build(&ReportInput { reconstruction: Some(&made), ..testing::input(&decoded) }).pixels.unwrap();
+        let expected = PixelCounts {
+            total: 12,
+            lit: 11,
+            valid: 2,
+            plain: 0,
+            edge: 1,
+            inverted: 1,
+            unlit: 1,
+            saturated: 1,
+            ambiguous: 1,
+            off_boundary: 1,
+            out_of_projector: 1,
+            out_of_volume: 1,
+            rejected_by_row: 2,
+            rejected_by_vote: 1,
+            interreflection: 1,
+            half_saturated: 1,
+        };
+        assert_eq!(counts, expected);
+        assert_eq!(build(&testing::input(&decoded)).pixels.unwrap().plain, 1);
+    }
+
+    proptest! {
+        #[test]
+        fn counts_add_up_and_do_not_depend_on_the_order_of_rows(classes in prop::collection::vec(0usize..12, 96), turn in 1usize..8) {
+            let mut decoded = testing::decoded(12, 8);
+            decoded.class = Grid::from_vec(12, 8, classes.iter().map(|&class| Class::ALL[class]).collect());
+            let counts = count(&decoded, &decoded.class);
+            prop_assert_eq!(counts.total, 96);
+            prop_assert_eq!(counts.lit + counts.unlit, counts.total);
+            prop_assert_eq!(counts.plain + counts.edge + counts.inverted, counts.valid);
+            let lost = counts.saturated + counts.ambiguous + counts.off_boundary + counts.out_of_projector
+                + counts.out_of_volume + counts.rejected_by_row + counts.rejected_by_vote + counts.interreflection;
+            prop_assert_eq!(counts.valid + lost, counts.lit);
+            decoded.class.data_mut().rotate_left(12 * turn);
+            prop_assert_eq!(count(&decoded, &decoded.class), counts);
+        }
+    }
+
+    #[test]
+    fn a_region_takes_all_its_valid_points_two_pixels_off_its_border() {
+        let mut decoded = testing::decoded(60, 40);
+        // Rejected and unlit inside; whatever happens on the border does not count.
+        decoded.class.data_mut()[20 * 60 + 20] = Class::Ambiguous;
+        decoded.class.data_mut()[20 * 60 + 21] = Class::Unlit;
+        let mut made = testing::reconstruction(&decoded);
+        made.cloud.point_mm.data_mut()[11 * 60 + 11][2] = 2000.0;
+        // One outlier inside stays in.
+        made.cloud.point_mm.data_mut()[22 * 60 + 30][2] += 5.0;
+        let regions = ["box=10,10,30,20".parse().unwrap()];
+        let report = build(&ReportInput {
+            reconstruction: Some(&made),
+            regions: &regions,
+            ..testing::input(&decoded)
+        });
+        let [plane] = &report.planes[..] else { panic!("one plane") };
+        let pixels = 26 * 16;
+        assert_eq!((plane.name.as_str(), plane.points, plane.lit), ("box", pixels - 2, pixels - 1));
+        assert_eq!(plane.coverage, Some((pixels - 2) as f64 / (pixels - 1) as f64));
+        let oracle: Vec<_> = (12..28)
+            .flat_map(|y| (12..38).map(move |x| (x, y)))
+            .filter(|&(x, y)| made.class.at(x, y).is_valid())
+            .map(|(x, y)| testing::point(&made, x, y))
+            .collect();
+        let fit = plane::fit_plane(&oracle).unwrap();
+        assert_eq!(
+            (plane.rmse_mm, plane.p95_mm, plane.bow_mm),
+            (Some(fit.rmse_mm), Some(fit.p95_mm), fit.bow_mm)
+        );
+        assert!(fit.rmse_mm > 0.2, "{}", fit.rmse_mm);
+        assert_eq!(plane.truth, None);
+    }
+
+    #[test]
+    fn a_region_without_calibration_has_its_coverage_and_no_millimetres() {
+        let decoded = testing::decoded(60, 40);
+        let regions = ["box=10,10,30,20".parse().unwrap()];
+        let report = build(&ReportInput { regions: &regions, ..testing::input(&decoded) });
+        let plane = &report.planes[0];
+        assert_eq!((plane.points, plane.coverage, plane.rmse_mm), (0, Some(1.0), None));
+    }
+
+    #[test]
+    fn planar_objects_of_a_simulated_scene_are_measured_by_its_truth() {
+        let mut decoded = testing::decoded(60, 40);
+        let mut truth = testing::truth(&decoded);
+        truth.objects = ["plate", "ball", "step", "hidden"]
+            .into_iter()
+            .map(|name| crate::truth::TruthObject { name: name.into(), planar: name != "ball" })
+            .collect();
+        // Three stripes of 20 columns; the lower half of the step lies in shadow, and one pixel there claims a value.
+        for index in 0..60 * 40 {
+            let (x, y) = (index % 60, index / 60);
+            truth.object.data_mut()[index] = (x / 20) as u8;
+            if x >= 40 && y >= 20 {
+                truth.column.data_mut()[index] = f32::NAN;
+                decoded.class.data_mut()[index] =
+                    if (x, y) == (50, 30) { Class::Valid } else { Class::Unlit };
+            }
+        }
+        // A lit pixel of the step that the decoder calls unlit: no way to look better.
+        decoded.class.data_mut()[10 * 60 + 50] = Class::Unlit;
+        let mut made = testing::reconstruction(&decoded);
+        made.cloud.point_mm.data_mut()[30 * 60 + 50][2] += 5.0;
+        let report = build(&ReportInput {
+            reconstruction: Some(&made),
+            truth: Some(&truth),
+            ..testing::input(&decoded)
+        });
+        let names: Vec<_> = report.planes.iter().map(|plane| plane.name.as_str()).collect();
+        assert_eq!(names, ["plate", "step"]);
+        let [plate, step] = &report.planes[..] else { panic!("two planes") };
+        assert_eq!((plate.points, plate.lit, plate.coverage), (16 * 36, 16 * 36, Some(1.0)));
+        assert!(plate.rmse_mm.unwrap() < 1e-4);
+        // 16 columns, rows 2..20 lit.
+        assert_eq!((step.lit, step.points), (16 * 18, 16 * 18 - 1 + 1));
+        assert_eq!(step.coverage, Some((16.0 * 18.0 - 1.0) / (16.0 * 18.0)));
+        assert!(step.rmse_mm.unwrap() > 0.2, "a point in shadow is a point");
+        assert!(step.rmse_off_shadow_mm.unwrap() < 1e-4);
+        assert_eq!(step.truth.as_ref().unwrap().pixels, 16 * 16);
+        let truth = report.truth.unwrap();
+        assert_eq!(truth.interior.pixels, 16 * 36 * 2 + 16 * 16);
+        assert_eq!(truth.border.valid_in_shadow, 1);
+    }
+}

@@ -5,7 +5,7 @@ use nalgebra::{Matrix3, Matrix6, SymmetricEigen, Vector3, Vector6};
 use super::statistics;
 
 /// Points nearer to a line than this share of their extent do not fix a plane.
-const COLLINEAR: f64 = 1e-9;
+const COLLINEAR: f64 = 1e-6;
 
 /// Points of a region against their best plane. All points count; none is an outlier.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -195,7 +195,8 @@ mod tests {
             let points = sheet(2, upright(), |x, y| heights[((y + 2.0) * 5.0 + x + 2.0) as usize]);
             let fit = fit_plane(&points).unwrap();
             let normal = (fit.normal + Vector3::new(tilt[0], tilt[1], 0.0)).normalize();
-            let sum: f64 = points.iter().map(|p| ((p - fit.centroid_mm).dot(&normal) + lift).powi(2)).sum();
+            let apart = |p: &Vector3<f64>| -> f64 { (p - fit.centroid_mm).dot(&normal) + lift };
+            let sum: f64 = points.iter().map(|p| apart(p).powi(2)).sum();
             prop_assert!((sum / 25.0).sqrt() >= fit.rmse_mm - 1e-12);
         }
     }

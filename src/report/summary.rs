@@ -81,7 +81,7 @@ fn coverage(text: &mut Text, report: &Report) {
     text.entry(
         "coverage",
         &format!(
-            "{} of the {} pixels that saw projector light were measured",
+            "{} of {} pixels with projector light were measured",
             percent(coverage),
             grouped(pixels.lit)
         ),
@@ -108,7 +108,7 @@ fn capture(text: &mut Text, report: &Report) {
         text.entry(
             "light check",
             &format!(
-                "{:.2} times the camera's noise (1.00 is ideal), worst {:.2} at {} bit {}",
+                "{:.2} x the camera's noise (1.00 is ideal), worst {:.2}: {} bit {}",
                 residual.median, residual.worst, residual.worst_pair.axis, residual.worst_pair.bit
             ),
         );
@@ -217,5 +217,112 @@ impl Text {
     fn line(&mut self, line: &str) {
         self.0.push_str(line.trim_end());
         self.0.push('\n');
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+    use crate::report::{CaptureSummary, Diagnosis, Reason, ReportInput, build, testing};
+
+    fn report(simulated: bool, found: &[Reason]) -> Report {
+        let decoded = testing::decoded(160, 120);
+        let (truth, made) = (testing::truth(&decoded), testing::reconstruction(&decoded));
+        let capture = CaptureSummary {
+            seconds: 1.5,
+            limit_seconds: 1.47,
+            hold_frames: 2,
+            timing_measured: true,
+            ..CaptureSummary::default()
+        };
+        let regions = ["table top=10,10,40,30".parse().unwrap()];
+        build(&ReportInput {
+            reconstruction: Some(&made),
+            truth: simulated.then_some(&truth),
+            capture: Some(&capture),
+            regions: &regions,
+            simulated,
+            found,
+            ..testing::input(&decoded)
+        })
+    }
+
+    #[test]
+    fn a_sound_scan_is_told_in_a_few_lines() {
+        let directory = Path::new("/data/scans/7");
+        let text =
+            summary(&report(false, &[]), Some(Outputs { directory, files: &["cloud.ply", "report.json"] }));
+        let expected = "\
+verdict       ok
+scan          mode pse, 44 frames of 160 x 120 px
+coverage      100.0 % of 19 200 pixels with projector light were measured
+points        19 200
+capture       1.50 s; the display allows no less than 1.47 s
+light check   1.00 x the camera's noise (1.00 is ideal), worst 1.00: row bit 9
+drift         +0.00 % between the first and the last frames
+flatness      mm             points measured      rms     95 %      bow
+              table top         936  100.0 %    0.000    0.000    0.000
+results       /data/scans/7
+              cloud.ply report.json
+";
+        assert_eq!(text, expected);
+    }
+
+    #[test]
+    fn simulated_figures_are_marked_once_and_before_them() {
+        let text = summary(&report(true, &[]), None);
+        assert_eq!(text.matches("simulated").count(), 2, "{text}");
+        assert!(text.find("simulated").unwrap() < text.find("coverage").unwrap());
+        assert!(text.contains("truth         100.0 % measured, 0 of 18 096 wrong"), "{text}");
+        assert!(!summary(&report(false, &[]), None).contains("simulated"));
+    }
+
+    #[test]
+    fn reasons_come_first_and_wrapped() {
+        let long =
+            "in pair column bit 3 half of the pixels do not add up to the references: scan again, and again";
+        let found = [Reason::failed(Diagnosis::StaleFrame, long, json!({}))];
+        let text = summary(&report(false, &found), None);
+        assert!(text.starts_with("verdict       FAILED"), "{text}");
+        assert!(
+            text.lines().nth(1).unwrap().starts_with("  failed      stale-frame: in pair column bit 3"),
+            "{text}"
+        );
+        assert!(text.lines().nth(2).unwrap().starts_with("              "), "{text}");
+        let joined = text.split_whitespace().collect::<Vec<_>>().join(" ");
+        assert!(joined.contains(long), "{text}");
+    }
+
+    #[test]
+    fn lines_are_narrow() {
+        let words = "word ".repeat(100);
+        let found = [Reason::degraded(Diagnosis::Motion, words, json!({}))];
+        for line in summary(&report(true, &found), None).lines() {
+            assert!(line.chars().count() <= WIDTH, "{line}");
+            assert_eq!(line, line.trim_end());
+        }
+    }
+
+    #[test]
+    fn nothing_known_is_nothing_said() {
+        let size = crate::report::Size { width: 4, height: 3 };
+        let text = summary(&build(&ReportInput::new(polscan_patterns::Mode::Fast, size, 0)), None);
+        assert!(
+            text.contains("nothing was decoded") && !text.contains("coverage") && !text.contains("NaN"),
+            "{text}"
+        );
+    }
+
+    #[test]
+    fn numbers_are_told_honestly() {
+        assert_eq!(percent(Some(1.0)), "100.0 %");
+        assert_eq!(percent(Some(0.99996)), "> 99.9 %");
+        assert_eq!(percent(Some(0.9994)), "99.9 %");
+        assert_eq!(percent(None), "-");
+        assert_eq!(grouped(0), "0");
+        assert_eq!(grouped(999), "999");
+        assert_eq!(grouped(1_920_000), "1 920 000");
     }
 }

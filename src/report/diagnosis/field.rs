@@ -11,8 +11,12 @@ const SAMPLES: usize = 1 << 17;
 const OUTLIER_SIGMA: f64 = 5.0;
 /// A row of the image counts with this many lit pixels.
 const ROW_PIXELS: u32 = 16;
-/// A torn frame is bad on this share of the pixels of one side of the tear...
-const TORN_SIDE: f64 = 0.2;
+/// A torn frame is bad on this share of the pixels of one side of the tear: another pattern differs on half of them...
+const TORN_SIDE: f64 = 0.3;
+/// ...where a row of the image is bad with this share of its pixels...
+const TORN_ROW: f64 = 0.15;
+/// ...and this share of the rows is bad: what moves seldom reaches from a side of the image to the tear...
+const TORN_ROWS_BAD: f64 = 0.8;
 /// ...sound on all but this share of the other side...
 const SOUND_SIDE: f64 = 0.02;
 /// ...and each side has this share of the rows.
@@ -59,8 +63,9 @@ pub fn modulation_sigma(decoded: &Decoded) -> Option<f64> {
     statistics::median(&mut samples)
 }
 
-/// Looks at the residuals of a decode of which `disturbed` pairs are bad.
-pub fn survey(decoded: &Decoded, disturbed: usize) -> Field {
+/// Looks at the residuals of a decode of which `disturbed` pairs are bad. `striped`: they code rows, so that another
+/// pattern differs on whole bands of rows.
+pub fn survey(decoded: &Decoded, disturbed: usize, striped: bool) -> Field {
     let pairs = decoded.pairs.len() as f64;
     // Sum of squares of `pairs` residuals: 4 sigma of its own spread, and one outlier on top.
     let limit = pairs + 4.0 * (2.0 * pairs).sqrt() + OUTLIER_SIGMA * OUTLIER_SIGMA;
@@ -90,12 +95,12 @@ pub fn survey(decoded: &Decoded, disturbed: usize) -> Field {
     Field {
         affected: statistics::share(affected, total).unwrap_or(0.0),
         relative: statistics::median(&mut relative),
-        torn_at: tear(&rows),
+        torn_at: tear(&rows, striped),
     }
 }
 
 /// The row that parts a bad side from a sound one. `rows`: lit and affected pixels of each.
-fn tear(rows: &[[u32; 2]]) -> Option<usize> {
+fn tear(rows: &[[u32; 2]], striped: bool) -> Option<usize> {
     let usable: Vec<(usize, f64)> = rows
         .iter()
         .enumerate()
@@ -104,13 +109,19 @@ fn tear(rows: &[[u32; 2]]) -> Option<usize> {
         .collect();
     let total: f64 = usable.iter().map(|(_, share)| share).sum();
     let least = ((usable.len() as f64 * TORN_ROWS).ceil() as usize).max(2);
+    let is_whole = |side: &[(usize, f64)]| {
+        let bad = side.iter().filter(|(_, share)| *share >= TORN_ROW).count();
+        striped || bad as f64 >= TORN_ROWS_BAD * side.len() as f64
+    };
     let mut above = 0.0;
     let mut best: Option<(f64, usize)> = None;
     for (count, &(y, share)) in usable.iter().enumerate() {
         if count >= least && usable.len() - count >= least {
             let means = [above / count as f64, (total - above) / (usable.len() - count) as f64];
             let (low, high) = (means[0].min(means[1]), means[0].max(means[1]));
-            if low <= SOUND_SIDE && high >= TORN_SIDE && best.is_none_or(|(gap, _)| high - low > gap) {
+            let side = if means[0] > means[1] { &usable[..count] } else { &usable[count..] };
+            let torn = low <= SOUND_SIDE && high >= TORN_SIDE && is_whole(side);
+            if torn && best.is_none_or(|(gap, _)| high - low > gap) {
                 best = Some((high - low, y));
             }
         }
@@ -127,7 +138,7 @@ mod tests {
     #[test]
     fn noise_affects_nothing() {
         let decoded = testing::decoded(64, 48);
-        let field = survey(&decoded, 1);
+        let field = survey(&decoded, 1, false);
         assert_eq!((field.affected, field.relative, field.torn_at), (0.0, None, None));
     }
 
@@ -152,7 +163,7 @@ mod tests {
                 *value = residual;
             }
         }
-        let field = survey(&decoded, 1);
+        let field = survey(&decoded, 1, false);
         assert_eq!(field.affected, 0.5);
         assert!((field.relative.unwrap() - 1.0).abs() < 1e-3, "{field:?}");
         assert_eq!(field.torn_at, None);
@@ -164,7 +175,17 @@ mod tests {
         for value in &mut decoded.residual.data_mut()[..30 * 64] {
             *value = 40.0;
         }
-        assert_eq!(survey(&decoded, 1).torn_at, Some(30));
+        assert_eq!(survey(&decoded, 1, false).torn_at, Some(30));
+    }
+
+    #[test]
+    fn a_tear_of_rows_is_found_in_bands() {
+        let mut decoded = testing::decoded(64, 48);
+        for y in (0..48).filter(|y| *y >= 24 && y / 4 % 2 == 0) {
+            decoded.residual.data_mut()[y * 64..][..64].fill(40.0);
+        }
+        assert_eq!(survey(&decoded, 1, true).torn_at, Some(24));
+        assert_eq!(survey(&decoded, 1, false).torn_at, None);
     }
 
     #[test]
@@ -173,7 +194,7 @@ mod tests {
         for y in 20..30 {
             decoded.residual.data_mut()[y * 64 + 10..][..30].fill(40.0);
         }
-        let field = survey(&decoded, 1);
+        let field = survey(&decoded, 1, false);
         assert_eq!(field.torn_at, None);
         assert!((field.affected - 300.0 / (64.0 * 48.0)).abs() < 1e-9);
     }

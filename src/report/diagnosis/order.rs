@@ -181,7 +181,6 @@ mod tests {
             for bit in 0..4 {
                 let found = exchanged(axis, bit, false).unwrap_or_else(|| panic!("{axis} bit {bit}"));
                 assert_eq!(found.pair, Some((axis, bit)));
-                assert!(found.share > 0.7, "{found:?}");
             }
         }
     }

@@ -108,20 +108,29 @@ pub fn diagnose(decoded: &Decoded, modulation_drift: Option<f64>) -> Vec<Reason>
     let mut reasons = Vec::new();
     reasons.extend(brightness(decoded, modulation_drift, &coarse, &shifted));
     if !disturbed.is_empty() {
-        let found = field::survey(decoded, disturbed.len());
+        let found = survey(decoded, &disturbed);
         reasons.push(disturbance(&disturbed, coarse.len(), found));
     }
     match lone(&fine, modulation) {
         Some(view) if disturbed.is_empty() => {
-            let found = field::survey(decoded, 1);
+            let found = survey(decoded, &[view]);
             reasons.push(one_frame(&[view], found));
         }
         Some(_) => {}
         // With most pairs disturbed, what happens at edges is no evidence of its own.
-        None if 3 * sound.len() >= coarse.len() => reasons.extend(nonlinear(&sound, &fine)),
+        None if 3 * sound.len() >= coarse.len() => {
+            // Light that changes shifts fine pairs as it does coarse ones.
+            let fine = if shifted.is_empty() { &fine[..] } else { &[] };
+            reasons.extend(nonlinear(&sound, fine));
+        }
         None => {}
     }
     reasons
+}
+
+fn survey(decoded: &Decoded, disturbed: &[View]) -> Field {
+    let striped = disturbed.iter().all(|view| view.pair.axis == Axis::Row);
+    field::survey(decoded, disturbed.len(), striped)
 }
 
 fn views(pairs: &[PairResidual]) -> Vec<View<'_>> {
@@ -290,7 +299,8 @@ fn one_frame(disturbed: &[View], found: Field) -> Reason {
     let share = worst(disturbed, |view| view.outliers()).map_or(0.0, |view| view.outliers());
     let evidence = evidence_of(disturbed, found);
     let names = names(disturbed);
-    if let Some(row) = found.torn_at {
+    let by_modulation = found.relative.is_none_or(|relative| relative >= STALE_SHARE);
+    if let Some(row) = found.torn_at.filter(|_| by_modulation) {
         return Reason::failed(
             Diagnosis::TornFrame,
             format!(
@@ -300,8 +310,7 @@ fn one_frame(disturbed: &[View], found: Field) -> Reason {
             evidence,
         );
     }
-    let whole = share >= WHOLE_FRAME && found.relative.is_none_or(|relative| relative >= STALE_SHARE);
-    if !whole {
+    if share < WHOLE_FRAME || !by_modulation {
         return motion(disturbed, share, evidence);
     }
     Reason::failed(
@@ -378,4 +387,268 @@ fn nonlinear(sound: &[View], fine: &[View]) -> Option<Reason> {
             "finest_pairs": all_evidence(&finest),
         }),
     ))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::report::{Verdict, testing};
+
+    /// A sound decode, spoilt; then the diagnoses with their severities.
+    fn found(spoil: impl FnOnce(&mut Decoded)) -> Vec<(Diagnosis, Verdict)> {
+        found_with(None, spoil)
+    }
+
+    fn found_with(
+        modulation_drift: Option<f64>,
+        spoil: impl FnOnce(&mut Decoded),
+    ) -> Vec<(Diagnosis, Verdict)> {
+        let mut decoded = testing::decoded(64, 48);
+        spoil(&mut decoded);
+        let reasons = diagnose(&decoded, modulation_drift);
+        for reason in &reasons {
+            assert!(reason.message.len() > 60 && reason.evidence.is_object(), "{reason:?}");
+        }
+        reasons.into_iter().map(|reason| (reason.diagnosis, reason.severity)).collect()
+    }
+
+    const PAIRS: f64 = 20.0;
+
+    /// Root mean square over all pairs of a residual of `share` of the modulation in `bad` pairs and noise in all.
+    fn residual(decoded: &Decoded, share: f64, bad: f64) -> f32 {
+        let amplitude = share * field::modulation_sigma(decoded).unwrap();
+        ((bad * amplitude * amplitude + PAIRS) / PAIRS).sqrt() as f32
+    }
+
+    /// Sets the residual where `place` says so.
+    fn spread(decoded: &mut Decoded, value: f32, place: impl Fn(usize, usize) -> bool) {
+        let width = decoded.residual.width();
+        for (index, residual) in decoded.residual.data_mut().iter_mut().enumerate() {
+            if place(index % width, index / width) {
+                *residual = value;
+            }
+        }
+    }
+
+    #[test]
+    fn noise_is_no_reason() {
+        assert_eq!(found(|_| {}), []);
+    }
+
+    #[test]
+    fn what_sound_captures_of_real_cameras_show_is_no_reason() {
+        // 8-bit frames round all pairs down alike by half a sigma, a few pixels glitter.
+        let medians = [0.0, -0.26, -0.27, -0.29, -0.36, -0.5, -0.53, -0.56, -0.56, -0.85];
+        assert_eq!(
+            found(|decoded| for pair in &mut decoded.pairs {
+                pair.median = medians[usize::from(pair.bit)];
+                pair.sigma = 0.9;
+                pair.flat_outliers = 0.0002;
+                pair.edge_outliers = 0.0005;
+            }),
+            []
+        );
+    }
+
+    #[test]
+    fn no_pairs_give_no_reasons() {
+        assert_eq!(found(|decoded| decoded.pairs.clear()), []);
+        assert_eq!(
+            found(|decoded| for pair in &mut decoded.pairs {
+                (pair.sigma, pair.median) = (f64::NAN, f64::NAN);
+                (pair.flat_outliers, pair.edge_outliers, pair.pixels) = (f64::NAN, f64::NAN, 0);
+            }),
+            []
+        );
+    }
+
+    /// Shares of pixels at edges beyond 5 sigma, and medians, as a real projector with a gamma showed them.
+    #[test]
+    fn a_gamma_is_a_nonlinear_response() {
+        let edges = [0.07, 0.08, 0.21, 0.06, 0.08, 0.12, 0.13, 0.17, 0.43, 0.90];
+        let gamma = |decoded: &mut Decoded| {
+            for pair in &mut decoded.pairs {
+                pair.edge_outliers = edges[usize::from(pair.bit)];
+                if pair.bit == 9 {
+                    (pair.sigma, pair.median, pair.flat_outliers) = (3.1, -15.4, 0.28);
+                }
+                if pair.bit == 8 {
+                    (pair.sigma, pair.median, pair.flat_outliers) = (3.2, -4.1, 0.01);
+                }
+            }
+        };
+        assert_eq!(found(gamma), [(Diagnosis::NonlinearResponse, Verdict::Degraded)]);
+        assert_eq!(
+            found(|decoded| {
+                gamma(decoded);
+                decoded.pairs.retain(|pair| pair.axis == Axis::Column);
+            }),
+            [(Diagnosis::NonlinearResponse, Verdict::Degraded)]
+        );
+    }
+
+    #[test]
+    fn crosstalk_of_the_finest_stripes_alone_is_a_nonlinear_response() {
+        let crosstalk = |decoded: &mut Decoded| {
+            for pair in decoded.pairs.iter_mut().filter(|pair| pair.bit == 9) {
+                (pair.median, pair.edge_outliers) = (-6.0, 0.6);
+            }
+        };
+        assert_eq!(found(crosstalk), [(Diagnosis::NonlinearResponse, Verdict::Degraded)]);
+    }
+
+    /// An inverse that shows its own pattern again: the sum is off by the whole modulation, up or down.
+    fn repeat(decoded: &mut Decoded, bit: usize) {
+        let modulation = field::modulation_sigma(decoded).unwrap();
+        let pair = &mut decoded.pairs[bit];
+        (pair.sigma, pair.median, pair.flat_outliers) = (1.48 * modulation, 0.9 * modulation, 1.0);
+        pair.edge_outliers = 0.9;
+        let value = residual(decoded, 1.0, 1.0);
+        spread(decoded, value, |_, _| true);
+    }
+
+    #[test]
+    fn a_frame_of_another_picture_is_stale() {
+        for bit in 0..10 {
+            assert_eq!(
+                found(|decoded| repeat(decoded, bit)),
+                [(Diagnosis::StaleFrame, Verdict::Failed)],
+                "{bit}"
+            );
+        }
+        // The inverse of the bit before: half of the pixels agree by chance, the others are off either way.
+        for bit in 1..10 {
+            let half = |decoded: &mut Decoded| {
+                let pair = &mut decoded.pairs[bit];
+                (pair.sigma, pair.flat_outliers, pair.edge_outliers) = (1.4, 0.5, 0.5);
+                let value = residual(decoded, 1.0, 1.0);
+                spread(decoded, value, |x, _| x % 4 < 2);
+            };
+            assert_eq!(found(half), [(Diagnosis::StaleFrame, Verdict::Failed)], "{bit}");
+        }
+    }
+
+    #[test]
+    fn a_shift_as_large_as_the_modulation_is_no_flicker() {
+        // Where the pattern is nearly uniform over what the camera sees, a stale frame moves all pixels one way.
+        let uniform = |decoded: &mut Decoded| {
+            repeat(decoded, 0);
+            decoded.pairs[0].sigma = 1.2;
+        };
+        assert_eq!(found(uniform), [(Diagnosis::StaleFrame, Verdict::Failed)]);
+    }
+
+    #[test]
+    fn a_whole_sequence_one_frame_late_is_stale() {
+        let late = |decoded: &mut Decoded| {
+            for pair in &mut decoded.pairs {
+                (pair.sigma, pair.flat_outliers, pair.edge_outliers) = (1.4, 0.5, 0.5);
+            }
+            let value = residual(decoded, 1.0, PAIRS / 2.0);
+            spread(decoded, value, |_, _| true);
+        };
+        assert_eq!(found(late), [(Diagnosis::StaleFrame, Verdict::Failed)]);
+    }
+
+    #[test]
+    fn a_rest_of_the_picture_before_is_an_unsettled_display() {
+        let unsettled = |decoded: &mut Decoded| {
+            for pair in &mut decoded.pairs {
+                (pair.sigma, pair.flat_outliers, pair.edge_outliers) = (1.4, 0.4, 0.4);
+            }
+            let value = residual(decoded, 0.2, PAIRS / 2.0);
+            spread(decoded, value, |_, _| true);
+        };
+        assert_eq!(found(unsettled), [(Diagnosis::UnsettledDisplay, Verdict::Degraded)]);
+    }
+
+    #[test]
+    fn a_frame_of_two_pictures_is_torn() {
+        for bit in [2, 8] {
+            let torn = |decoded: &mut Decoded| {
+                let pair = &mut decoded.pairs[bit];
+                (pair.flat_outliers, pair.edge_outliers) = (0.35, 0.35);
+                let value = residual(decoded, 1.0, 1.0);
+                spread(decoded, value, |_, y| y >= 31);
+            };
+            assert_eq!(found(torn), [(Diagnosis::TornFrame, Verdict::Failed)], "{bit}");
+        }
+    }
+
+    #[test]
+    fn a_part_of_the_image_that_fails_in_many_pairs_moved() {
+        let moved = |share: f64| {
+            found(move |decoded| {
+                for pair in decoded.pairs.iter_mut().filter(|pair| pair.axis == Axis::Row) {
+                    (pair.flat_outliers, pair.edge_outliers) = (share, share);
+                }
+                let value = residual(decoded, 0.6, 10.0);
+                spread(decoded, value, |x, y| (10..30).contains(&x) && (10..30).contains(&y));
+            })
+        };
+        assert_eq!(moved(0.13), [(Diagnosis::Motion, Verdict::Degraded)]);
+        assert_eq!(moved(0.6), [(Diagnosis::Motion, Verdict::Failed)]);
+        assert_eq!(moved(0.0015), []);
+    }
+
+    #[test]
+    fn a_part_of_the_image_that_fails_in_one_pair_moved_through() {
+        let passed = |decoded: &mut Decoded| {
+            decoded.pairs[3].flat_outliers = 0.1;
+            let value = residual(decoded, 0.6, 1.0);
+            spread(decoded, value, |x, y| (10..30).contains(&x) && (10..30).contains(&y));
+        };
+        assert_eq!(found(passed), [(Diagnosis::Motion, Verdict::Degraded)]);
+    }
+
+    #[test]
+    fn a_handful_of_pixels_is_no_evidence() {
+        assert_eq!(
+            found(|decoded| {
+                decoded.pairs[3].flat_outliers = 0.01;
+                decoded.pairs[3].pixels = 1900;
+            }),
+            []
+        );
+    }
+
+    #[test]
+    fn brightness_to_and_fro_is_flicker() {
+        let flicker = |decoded: &mut Decoded| {
+            for (index, pair) in decoded.pairs.iter_mut().enumerate() {
+                pair.median = [0.0, 2.0, -1.5, 0.3, 1.9, -2.2][index % 6];
+            }
+        };
+        assert_eq!(found(flicker), [(Diagnosis::Flicker, Verdict::Degraded)]);
+        // So strong that all pixels are outliers, at edges as well; still one common shift.
+        let strong = |decoded: &mut Decoded| {
+            for (index, pair) in decoded.pairs.iter_mut().enumerate() {
+                pair.median = if index % 3 == 1 { 12.0 } else { 0.0 };
+                if index % 3 == 1 {
+                    (pair.sigma, pair.flat_outliers, pair.edge_outliers) = (4.0, 0.97, 0.97);
+                }
+            }
+        };
+        assert_eq!(found(strong), [(Diagnosis::Flicker, Verdict::Degraded)]);
+    }
+
+    #[test]
+    fn brightness_that_goes_one_way_is_drift() {
+        let steady = |decoded: &mut Decoded| {
+            for (index, pair) in decoded.pairs.iter_mut().enumerate() {
+                pair.median = 0.3 * index as f64 - 3.0;
+            }
+            decoded.drift = None;
+        };
+        assert_eq!(found(steady), [(Diagnosis::ExposureDrift, Verdict::Degraded)]);
+    }
+
+    #[test]
+    fn references_that_differ_are_drift_of_lamp_or_room() {
+        let drifted = |decoded: &mut Decoded| decoded.drift = Some(-0.05);
+        assert_eq!(found(drifted), [(Diagnosis::ExposureDrift, Verdict::Degraded)]);
+        assert_eq!(found_with(Some(-0.048), drifted), [(Diagnosis::ExposureDrift, Verdict::Degraded)]);
+        assert_eq!(found_with(Some(0.001), drifted), [(Diagnosis::AmbientDrift, Verdict::Degraded)]);
+        assert_eq!(found(|decoded| decoded.drift = Some(0.01)), []);
+    }
 }

@@ -2,7 +2,7 @@
 
 use serde_json::json;
 
-use super::{Diagnosis, Reason, order, pairs};
+use super::{Diagnosis, Reason, order, pairs, sensor};
 use crate::{
     cloud::RowCheck,
     decode::{Class, Decoded},
@@ -37,14 +37,6 @@ const ROW_REJECTED: f64 = 0.1;
 const ROW_WRONG: f64 = 0.5;
 /// Offset of the rows as a share of their gate.
 const ROW_OFFSET: f64 = 0.5;
-/// Dead pixels among the valid ones: sensors as sold have fewer.
-const DEAD: f64 = 1e-4;
-const LEAST_DEAD: u64 = 10;
-/// A line of the sensor counts where it crosses this many pixels with valid neighbours, and is dead where it fails on
-/// most of them.
-const LINE_PIXELS: u32 = 50;
-const LINE_DEAD: f64 = 0.9;
-
 /// All reasons why a scan is not `ok`, each diagnosis once.
 pub fn diagnose(input: &ReportInput, pixels: Option<&PixelCounts>) -> Vec<Reason> {
     let mut reasons = input.found.to_vec();
@@ -59,7 +51,7 @@ pub fn diagnose(input: &ReportInput, pixels: Option<&PixelCounts>) -> Vec<Reason
                 reasons.extend(polarization(input, decoded, pixels));
                 reasons.extend(saturated(decoded, pixels));
                 reasons.extend(input.reconstruction.and_then(|made| made.row_check).and_then(row_mismatch));
-                reasons.extend(sensor_defect(decoded, pixels));
+                reasons.extend(sensor::defect(decoded, pixels));
                 reasons.extend(low_coverage(pixels));
             }
         }
@@ -281,55 +273,6 @@ fn row_mismatch(check: RowCheck) -> Option<Reason> {
     })
 }
 
-/// Pixels that stay dark amid valid ones, and lines of them.
-fn sensor_defect(decoded: &Decoded, pixels: &PixelCounts) -> Option<Reason> {
-    let class = &decoded.class;
-    let (width, height) = (class.width(), class.height());
-    let valid = |x: usize, y: usize| class.at(x, y).is_valid();
-    let mut dead = 0u64;
-    // Crossed and dead pixels of each column and row of the sensor.
-    let (mut columns, mut rows) = (vec![[0u32; 2]; width], vec![[0u32; 2]; height]);
-    for y in 1..height.saturating_sub(1) {
-        for x in 1..width.saturating_sub(1) {
-            let failed = u32::from(!valid(x, y));
-            let (beside, above) = (valid(x - 1, y) && valid(x + 1, y), valid(x, y - 1) && valid(x, y + 1));
-            if beside {
-                columns[x][0] += 1;
-                columns[x][1] += failed;
-            }
-            if above {
-                rows[y][0] += 1;
-                rows[y][1] += failed;
-            }
-            let corners =
-                || valid(x - 1, y - 1) && valid(x + 1, y - 1) && valid(x - 1, y + 1) && valid(x + 1, y + 1);
-            dead += u64::from(class.at(x, y) == Class::Unlit && beside && above && corners());
-        }
-    }
-    let lines = |counts: &[[u32; 2]]| {
-        let is_dead = |[crossed, failed]: &[u32; 2]| {
-            *crossed >= LINE_PIXELS && f64::from(*failed) > LINE_DEAD * f64::from(*crossed)
-        };
-        counts.iter().enumerate().filter(|(_, count)| is_dead(count)).map(|(at, _)| at).collect::<Vec<_>>()
-    };
-    let (columns, rows) = (lines(&columns), lines(&rows));
-    let many = dead >= LEAST_DEAD && dead as f64 > DEAD * pixels.valid as f64;
-    if !many && columns.is_empty() && rows.is_empty() {
-        return None;
-    }
-    Some(Reason::degraded(
-        Diagnosis::SensorDefect,
-        format!(
-            "{} amid good ones, {} and {} of the sensor do not answer to light; clean the sensor's window, and \
-             check the camera with `polscan show white`; the pixels are left out",
-            plural(dead, "single pixel"),
-            plural(columns.len() as u64, "column"),
-            plural(rows.len() as u64, "row"),
-        ),
-        json!({ "pixels": dead, "columns": columns, "rows": rows }),
-    ))
-}
-
 fn low_coverage(pixels: &PixelCounts) -> Option<Reason> {
     let coverage = share(pixels.valid, pixels.lit).filter(|&coverage| coverage < POOR_COVERAGE)?;
     let causes = [
@@ -424,6 +367,280 @@ pub fn notes(input: &ReportInput, pixels: Option<&PixelCounts>) -> Vec<String> {
 }
 
 /// `1 frame`, `3 frames`.
-fn plural(count: u64, noun: &str) -> String {
+pub(super) fn plural(count: u64, noun: &str) -> String {
     format!("{count} {noun}{}", if count == 1 { "" } else { "s" })
+}
+
+#[cfg(test)]
+mod tests {
+    use polscan_drivers::camera::StreamStatistics;
+    use polscan_patterns::{Axis, Mode, Role};
+
+    use super::*;
+    use crate::{
+        report::{Report, Size, Verdict, build, testing},
+        sequencer::Retake,
+    };
+
+    /// Report of a sound decode, spoilt.
+    fn report(spoil: impl FnOnce(&mut Decoded)) -> Report {
+        report_with(spoil, |_| {})
+    }
+
+    fn report_with(spoil: impl FnOnce(&mut Decoded), change: impl FnOnce(&mut ReportInput)) -> Report {
+        let mut decoded = testing::decoded(160, 120);
+        let settings = testing::settings(160, 120);
+        spoil(&mut decoded);
+        let mut input = ReportInput { settings: Some(&settings), ..testing::input(&decoded) };
+        change(&mut input);
+        build(&input)
+    }
+
+    fn kinds(report: &Report) -> Vec<(Diagnosis, Verdict)> {
+        for reason in &report.reasons {
+            assert!(reason.message.len() > 60 && reason.evidence.is_object(), "{reason:?}");
+        }
+        report.reasons.iter().map(|reason| (reason.diagnosis, reason.severity)).collect()
+    }
+
+    fn classify(decoded: &mut Decoded, class: Class, which: impl Fn(usize, usize) -> bool) {
+        let width = decoded.class.width();
+        for (index, value) in decoded.class.data_mut().iter_mut().enumerate() {
+            if which(index % width, index / width) {
+                *value = class;
+            }
+        }
+    }
+
+    const DEGRADED: Verdict = Verdict::Degraded;
+    const FAILED: Verdict = Verdict::Failed;
+
+    #[test]
+    fn a_sound_scan_has_no_reasons_and_only_true_notes() {
+        let report = report(|_| {});
+        assert_eq!((report.verdict, kinds(&report)), (Verdict::Ok, vec![]));
+        assert_eq!(report.notes, ["no calibration, so no depth and no points"]);
+    }
+
+    #[test]
+    fn no_light_is_told_by_what_there_is() {
+        let dark = |decoded: &mut Decoded| {
+            classify(decoded, Class::Unlit, |x, y| (x, y) != (3, 3));
+            decoded.intensity.data_mut().fill(2);
+            // Whatever else was seen was seen on nothing.
+            decoded.pairs[2].flat_outliers = 0.9;
+        };
+        let bright = |decoded: &mut Decoded| {
+            classify(decoded, Class::Unlit, |_, _| true);
+        };
+        let dark = report(dark);
+        assert_eq!(kinds(&dark), [(Diagnosis::NothingLit, FAILED)]);
+        assert!(dark.reasons[0].message.contains("dark"), "{}", dark.reasons[0].message);
+        let turned = report(bright);
+        assert_eq!(kinds(&turned), [(Diagnosis::NothingLit, FAILED)]);
+        assert!(turned.reasons[0].message.contains("polarizer"), "{}", turned.reasons[0].message);
+        let plain = report_with(bright, |input| input.mode = Mode::Gray);
+        assert!(!plain.reasons[0].message.contains("polarizer"), "{}", plain.reasons[0].message);
+        // A small object in a dark room is an object.
+        let small = report(|decoded| classify(decoded, Class::Unlit, |x, y| x >= 10 || y >= 10));
+        assert_eq!(kinds(&small), []);
+    }
+
+    #[test]
+    fn exchanged_channels_are_told_apart_from_surfaces_that_scatter() {
+        let invert = |columns: usize| {
+            move |decoded: &mut Decoded| {
+                classify(decoded, Class::Inverted, |x, _| x < columns);
+                for y in 0..120 {
+                    decoded.dolp.data_mut()[y * 160..][..columns].fill(0.0);
+                }
+            }
+        };
+        assert_eq!(kinds(&report(invert(160))), [(Diagnosis::PolarizationInverted, DEGRADED)]);
+        let paper = report(invert(30));
+        assert_eq!(kinds(&paper), []);
+        assert!(paper.notes.iter().any(|note| note.contains("19 %")), "{:?}", paper.notes);
+        let gray = report_with(invert(160), |input| input.mode = Mode::Gray);
+        assert_eq!(kinds(&gray), [(Diagnosis::SwappedFrames, DEGRADED)]);
+    }
+
+    #[test]
+    fn an_analyser_turned_by_thirty_degrees_is_weak_and_by_twenty_is_not() {
+        let turned = |degrees: f32| {
+            move |decoded: &mut Decoded| {
+                decoded.dolp.data_mut().fill(0.96 * (2.0 * degrees.to_radians()).cos());
+            }
+        };
+        let report_30 = report(turned(30.0));
+        assert_eq!(kinds(&report_30), [(Diagnosis::PolarizationWeak, DEGRADED)]);
+        assert!(report_30.reasons[0].message.contains("31 degrees"), "{}", report_30.reasons[0].message);
+        assert_eq!(kinds(&report(turned(20.0))), []);
+        assert_eq!(kinds(&report_with(turned(30.0), |input| input.mode = Mode::Gray)), []);
+        // A dark half of the scene, where the room's light counts, says nothing of the polarizer.
+        let dark = report(|decoded| {
+            for y in 0..120 {
+                decoded.dolp.data_mut()[y * 160..][..110].fill(0.1);
+                decoded.intensity.data_mut()[y * 160..][..110].fill(3);
+            }
+        });
+        assert_eq!(kinds(&dark), []);
+    }
+
+    #[test]
+    fn glints_are_not_saturation_and_a_mirror_is() {
+        let glare = |columns: usize| {
+            move |decoded: &mut Decoded| {
+                classify(decoded, Class::Saturated, |x, _| x < columns);
+            }
+        };
+        assert_eq!(kinds(&report(glare(1))), []);
+        assert_eq!(kinds(&report(glare(3))), [(Diagnosis::Saturated, DEGRADED)]);
+        let half = |count: usize| {
+            move |decoded: &mut Decoded| {
+                decoded.half_saturated.data_mut()[..count].fill(true);
+            }
+        };
+        assert_eq!(kinds(&report(half(160 * 5))), []);
+        assert_eq!(kinds(&report(half(160 * 7))), [(Diagnosis::Saturated, DEGRADED)]);
+    }
+
+    #[test]
+    fn rows_that_disagree_speak_against_the_calibration() {
+        let judged = |median_px: f64, rejected_share: f64| {
+            let decoded = testing::decoded(160, 120);
+            let mut made = testing::reconstruction(&decoded);
+            let check = made.row_check.as_mut().unwrap();
+            (check.median_px, check.rejected_share) = (median_px, rejected_share);
+            kinds(&build(&ReportInput { reconstruction: Some(&made), ..testing::input(&decoded) }))
+        };
+        assert_eq!(judged(0.3, 0.02), []);
+        assert_eq!(judged(-0.8, 0.02), [(Diagnosis::RowMismatch, DEGRADED)]);
+        assert_eq!(judged(0.1, 0.2), [(Diagnosis::RowMismatch, DEGRADED)]);
+        assert_eq!(judged(2.0, 0.6), [(Diagnosis::RowMismatch, FAILED)]);
+    }
+
+    #[test]
+    fn frames_in_another_order_mirror_the_picture_or_put_edges_in_the_wrong_places() {
+        let mirrored = report(|decoded| {
+            for value in decoded.column.code.data_mut() {
+                *value = 127 - *value;
+            }
+        });
+        assert_eq!(kinds(&mirrored), [(Diagnosis::SwappedFrames, FAILED)]);
+        assert!(mirrored.reasons[0].message.contains("column bit 0"), "{}", mirrored.reasons[0].message);
+        let displaced = |columns: usize| {
+            kinds(&report(|decoded| classify(decoded, Class::OffBoundary, |x, _| x < columns)))
+        };
+        assert_eq!(displaced(60), [(Diagnosis::SwappedFrames, FAILED)]);
+        assert_eq!(displaced(20), []);
+    }
+
+    #[test]
+    fn dead_pixels_and_lines_are_a_defect_of_the_sensor() {
+        let specks = |count: usize| {
+            report(move |decoded| {
+                classify(decoded, Class::Unlit, |x, y| x % 10 == 5 && y == 30 && x / 10 < count)
+            })
+        };
+        assert_eq!(kinds(&specks(5)), []);
+        assert_eq!(kinds(&specks(12)), [(Diagnosis::SensorDefect, DEGRADED)]);
+        let column = report(|decoded| classify(decoded, Class::Ambiguous, |x, _| x == 77));
+        assert_eq!(kinds(&column), [(Diagnosis::SensorDefect, DEGRADED)]);
+        assert_eq!(column.reasons[0].evidence["columns"], json!([77]));
+        let row = report(|decoded| classify(decoded, Class::Unlit, |_, y| y == 11));
+        assert_eq!(row.reasons[0].evidence["rows"], json!([11]));
+        // A wide gap is a hole or a shadow.
+        let gap = report(|decoded| classify(decoded, Class::Unlit, |x, _| (70..73).contains(&x)));
+        assert_eq!(kinds(&gap), []);
+    }
+
+    #[test]
+    fn low_coverage_names_what_most_pixels_failed_for() {
+        let covered = |columns: usize| {
+            report(move |decoded| {
+                classify(decoded, Class::Ambiguous, |x, _| x >= columns);
+                classify(decoded, Class::OutOfVolume, |x, _| x >= columns + 20);
+            })
+        };
+        assert_eq!(kinds(&covered(60)), []);
+        let poor = covered(30);
+        assert_eq!(kinds(&poor), [(Diagnosis::LowCoverage, DEGRADED)]);
+        assert_eq!(poor.reasons[0].evidence["mostly"], "out_of_volume");
+        assert_eq!(kinds(&covered(5)), [(Diagnosis::LowCoverage, FAILED)]);
+        assert_eq!(covered(5).verdict, FAILED);
+    }
+
+    fn captured(change: impl FnOnce(&mut CaptureSummary)) -> Report {
+        let decoded = testing::decoded(40, 30);
+        let mut capture = CaptureSummary {
+            timing_measured: true,
+            statistics: StreamStatistics { triggers: 44, frames: 44, failed: 0 },
+            ..CaptureSummary::default()
+        };
+        change(&mut capture);
+        build(&ReportInput { capture: Some(&capture), ..testing::input(&decoded) })
+    }
+
+    #[test]
+    fn receipts_and_counters_speak() {
+        assert_eq!(kinds(&captured(|_| {})), []);
+        let role = Role::Code { axis: Axis::Row, bit: 2, inverse: true };
+        let early = captured(|capture| capture.early.push(role));
+        assert_eq!(kinds(&early), [(Diagnosis::StaleFrame, FAILED)]);
+        assert!(early.reasons[0].message.contains("row bit 2 inverse"));
+        let shared = captured(|capture| capture.shared_slide.push([role, Role::White]));
+        assert_eq!(kinds(&shared), [(Diagnosis::SwappedFrames, FAILED)]);
+        let lost = |capture: &mut CaptureSummary| capture.statistics.frames = 43;
+        assert_eq!(kinds(&captured(lost)), [(Diagnosis::LostFrame, DEGRADED)]);
+        let retake = Retake {
+            axis: Axis::Row,
+            bit: 2,
+            reason: "lost-frame".into(),
+            evidence: String::new(),
+            attempt: 1,
+        };
+        let recovered = captured(|capture| {
+            lost(capture);
+            capture.retaken.push(retake);
+        });
+        assert_eq!(kinds(&recovered), []);
+        assert!(
+            recovered.notes.iter().any(|note| note.contains("1 pair captured again")),
+            "{:?}",
+            recovered.notes
+        );
+    }
+
+    #[test]
+    fn each_diagnosis_comes_once_and_as_grave_as_it_was_found() {
+        let reason =
+            |severity| Reason { severity, ..Reason::degraded(Diagnosis::Motion, "moved", json!({})) };
+        let found = [reason(DEGRADED), reason(FAILED), reason(DEGRADED)];
+        let input =
+            ReportInput { found: &found, ..ReportInput::new(Mode::Pse, Size { width: 1, height: 1 }, 0) };
+        assert_eq!(diagnose(&input, None), [reason(FAILED)]);
+    }
+
+    #[test]
+    fn notes_say_what_was_estimated_assumed_and_lost() {
+        let noted = report_with(
+            |decoded| {
+                decoded.noise_estimated = true;
+                decoded.losses.push("no inverse frames".into());
+            },
+            |input| input.simulated = true,
+        );
+        let all = noted.notes.join("\n");
+        for part in ["estimated", "no inverse frames", "simulated"] {
+            assert!(all.contains(part), "{all}");
+        }
+        assert!(
+            captured(|capture| capture.timing_measured = false)
+                .notes
+                .iter()
+                .any(|note| note.contains("timing"))
+        );
+        let nothing = build(&ReportInput::new(Mode::Pse, Size { width: 1, height: 1 }, 0));
+        assert_eq!(nothing.notes, ["nothing was decoded"]);
+    }
 }
