@@ -311,3 +311,166 @@ impl<'a> Tracer<'a> {
         seen
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::sim::{scene::Scene, testing};
+
+    fn config(name: &str) -> toml::Table {
+        let path = format!("{}/../config/{name}", env!("CARGO_MANIFEST_DIR"));
+        std::fs::read_to_string(path).unwrap().parse().unwrap()
+    }
+
+    fn numbers(value: &toml::Value) -> Vec<f64> {
+        match value {
+            toml::Value::Array(values) => values.iter().flat_map(numbers).collect(),
+            value => vec![value.as_float().or(value.as_integer().map(|v| v as f64)).unwrap()],
+        }
+    }
+
+    /// OpenCV's projection, written out: x = X / Z, then distortion k1 k2 p1 p2 k3, then the matrix.
+    fn opencv(device: &toml::Value, [x, y, z]: [f64; 3]) -> [f64; 2] {
+        let (m, d) = (numbers(&device["matrix"]), numbers(&device["distortion"]));
+        let (x, y) = (x / z, y / z);
+        let r2 = x * x + y * y;
+        let radial = 1.0 + d[0] * r2 + d[1] * r2.powi(2) + d[4] * r2.powi(3);
+        let xd = x * radial + 2.0 * d[2] * x * y + d[3] * (r2 + 2.0 * x * x);
+        let yd = y * radial + d[2] * (r2 + 2.0 * y * y) + 2.0 * d[3] * x * y;
+        [m[0] * xd + m[2], m[4] * yd + m[5]]
+    }
+
+    #[test]
+    fn the_calibration_file_of_the_paper_rig_is_true() {
+        let description: RigDescription = config("sim.toml")["sim"].clone().try_into().unwrap();
+        let file = config("sim-calibration.toml");
+        let rotation = numbers(&file["transform"]["rotation"]);
+        let translation = numbers(&file["transform"]["translation_mm"]);
+        let (camera, projector) = (camera_lens(&description), projector_lens(&description));
+        let placement = placement(&description).unwrap();
+        for number in 0..2000u64 {
+            let random = |axis: u64| noise::mix(3 * number + axis) as f64 / u64::MAX as f64;
+            let point =
+                Vector3::new(400.0 * random(0) - 200.0, 300.0 * random(1) - 150.0, 800.0 + 400.0 * random(2));
+            let ours = camera.project(point).unwrap();
+            let theirs = opencv(&file["camera"], point.into());
+            let in_projector: [f64; 3] = std::array::from_fn(|row| {
+                (0..3).map(|axis| rotation[3 * row + axis] * point[axis]).sum::<f64>() + translation[row]
+            });
+            let lit = projector.project(placement.transform(point)).unwrap();
+            let expected = opencv(&file["projector"], in_projector);
+            for axis in 0..2 {
+                assert!((ours[axis] - theirs[axis]).abs() < 1e-6);
+                assert!((lit[axis] - expected[axis]).abs() < 1e-6, "{point}: {lit:?} {expected:?}");
+            }
+        }
+        let size = |device: &str| numbers(&file[device]["size"]);
+        assert_eq!(size("camera"), description.camera.size.map(f64::from));
+        assert_eq!(size("projector"), description.projector.size.map(f64::from));
+    }
+
+    /// Truth of one pixel the slow way: march along the ray until a surface is crossed, and from there to the light.
+    struct Oracle<'a> {
+        description: &'a RigDescription,
+        /// Height above the surface of each object, positive on the camera's side.
+        surfaces: &'a [fn([f64; 3]) -> Option<f64>],
+    }
+
+    impl Oracle<'_> {
+        /// Which surface a straight line crosses first, and where (share of the way).
+        fn crossing(&self, from: [f64; 3], to: [f64; 3], steps: u32) -> Option<(usize, [f64; 3])> {
+            let at =
+                |t: f64| -> [f64; 3] { std::array::from_fn(|axis| from[axis] + t * (to[axis] - from[axis])) };
+            for step in 0..steps {
+                let (a, b) = (f64::from(step) / f64::from(steps), f64::from(step + 1) / f64::from(steps));
+                for (number, height) in self.surfaces.iter().enumerate() {
+                    let side = |t| height(at(t));
+                    if let (Some(before), Some(after)) = (side(a), side(b))
+                        && before * after < 0.0
+                    {
+                        let (mut low, mut high) = (a, b);
+                        for _ in 0..60 {
+                            let middle = 0.5 * (low + high);
+                            let same = side(middle).is_some_and(|value| value * before > 0.0);
+                            if same { low = middle } else { high = middle }
+                        }
+                        return Some((number, at(low)));
+                    }
+                }
+            }
+            None
+        }
+
+        /// (object, z, lit) for a pixel of a camera without distortion.
+        fn truth(&self, x: f64, y: f64) -> Option<(usize, f64, bool)> {
+            let camera = &self.description.camera;
+            let [cx, cy] = middle_px(camera.size);
+            let far = 1500.0;
+            let end = [(x - cx) / camera.focal_px * far, (y - cy) / camera.focal_px * far, far];
+            let (object, point) = self.crossing([0.0, 0.0, 500.0].map(|z| z / far * 0.0), end, 30_000)?;
+            // Start a little above the surface.
+            let light = [52.4, 0.0, 0.0];
+            let start: [f64; 3] =
+                std::array::from_fn(|axis| point[axis] + 1e-4 * (light[axis] - point[axis]));
+            Some((object, point[2], self.crossing(start, light, 30_000).is_none()))
+        }
+    }
+
+    #[test]
+    fn truth_agrees_with_marching_along_rays() {
+        let scene: Scene = toml::from_str(
+            r#"
+            [materials.plaster]
+            diffuse = 0.8
+            [[objects]]
+            name = "wall"
+            material = "plaster"
+            level = 0.5
+            shape = { plane = { point_mm = [0.0, 0.0, 1050.0], normal = [0.1, 0.02, -1.0] } }
+            [[objects]]
+            name = "plate"
+            material = "plaster"
+            shape = { plane = { point_mm = [0.0, 0.0, 900.0], normal = [-0.1, 0.05, -1.0], x_mm = [-120.0, -30.0], y_mm = [-80.0, 60.0] } }
+            [[objects]]
+            name = "ball"
+            material = "plaster"
+            shape = { sphere = { centre_mm = [60.0, 10.0, 950.0], radius_mm = 50.0 } }
+            "#,
+        )
+        .unwrap();
+        let description = testing::small_rig();
+        let panel = Panel::new(&description.projector);
+        let world = World::new(&description, &scene, &panel).unwrap();
+        let surfaces: [fn([f64; 3]) -> Option<f64>; 3] = [
+            |[x, y, z]| Some(0.1 * x + 0.02 * y - (z - 1050.0)),
+            |[x, y, z]| {
+                ((-120.0..=-30.0).contains(&x) && (-80.0..=60.0).contains(&y))
+                    .then_some(-0.1 * x + 0.05 * y - (z - 900.0))
+            },
+            |[x, y, z]| Some(((x - 60.0).powi(2) + (y - 10.0).powi(2) + (z - 950.0).powi(2)).sqrt() - 50.0),
+        ];
+        let oracle = Oracle { description: &description, surfaces: &surfaces };
+        let (mut shadows, mut compared, mut differing) = (0, 0, 0);
+        for y in (0..240).step_by(7) {
+            for x in (0..320).step_by(5) {
+                let sight = world.sights[y * world.width + x];
+                let (object, depth, lit) = oracle.truth(x as f64, y as f64).unwrap();
+                compared += 1;
+                shadows += u32::from(!lit);
+                let agree = usize::from(sight.face) == object
+                    && (f64::from(sight.depth_mm) - depth).abs() < 1e-3
+                    && sight.is_lit() == lit;
+                // Steps of 0.05 mm may jump over a grazed rim.
+                differing += u32::from(!agree);
+                if agree && lit {
+                    let position = world.views[y * world.width + x].column;
+                    let u = f64::from(position) / f64::from(64 << 11);
+                    // The table starts some whole pixels before the panel.
+                    assert!(((u - f64::from(sight.at[0])).fract().abs() - 0.5).abs() > 0.499);
+                }
+            }
+        }
+        assert!(shadows > 30, "{shadows}");
+        assert!(differing * 200 < compared, "{differing} of {compared}");
+    }
+}
