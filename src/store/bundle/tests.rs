@@ -491,7 +491,11 @@ impl Disk for ClosedAround {
     }
 
     fn create_folder(&self, path: &Path) -> io::Result<()> {
-        if path.starts_with(&self.open) { RealDisk.create_folder(path) } else { Err(io::ErrorKind::PermissionDenied.into()) }
+        if path.starts_with(&self.open) {
+            RealDisk.create_folder(path)
+        } else {
+            Err(io::ErrorKind::PermissionDenied.into())
+        }
     }
 
     fn rename(&self, from: &Path, to: &Path) -> io::Result<()> {
