@@ -724,6 +724,14 @@ fn a_projector_that_dies_is_reported_and_so_is_that_it_is_not_black() {
 }
 
 #[test]
+fn black_does_not_wait_for_what_was_still_to_be_judged() {
+    // The first pair is complete when the slide after it fails.
+    let run = run(&[Fault::ProjectorGone(4)]);
+    assert_eq!(run.failure().partial.frames.len(), 4);
+    assert!(run.judge.judged.is_empty());
+}
+
+#[test]
 fn black_is_tried_twice_and_its_failure_does_not_cost_the_frames() {
     let once = run(&[Fault::NoBlack(1)]);
     assert!(once.ends_black() && once.findings().is_empty());
