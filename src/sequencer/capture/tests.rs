@@ -5,7 +5,7 @@ use std::sync::Mutex;
 
 use polscan_drivers::{
     camera::{AppliedSettings, CameraInfo, CameraSettings, PixelFormat, TriggerSource},
-    clock::VirtualClock,
+    clock::{MonotonicClock, VirtualClock},
     frame::{FrameStamp, PixelStore, Pixels},
     projector::{ProjectorInfo, ProjectorTiming, ReceiptMethod},
 };
@@ -75,9 +75,9 @@ enum Fault {
     CancelAtFrame(u64),
 }
 
-#[derive(Debug, Default)]
+#[derive(Debug)]
 struct World {
-    clock: VirtualClock,
+    clock: Arc<dyn Clock>,
     faults: Vec<Fault>,
     cancel: CancelFlag,
     /// Flips so far: when, and which slide (`None` is black).
@@ -441,7 +441,12 @@ fn sequence() -> Sequence {
 }
 
 fn rig(faults: &[Fault]) -> (Arc<World>, Panel, Eye) {
-    let world = Arc::new(World { faults: faults.to_vec(), ..World::default() });
+    rig_on(Arc::new(VirtualClock::default()), faults)
+}
+
+fn rig_on(clock: Arc<dyn Clock>, faults: &[Fault]) -> (Arc<World>, Panel, Eye) {
+    let (cancel, flips) = (CancelFlag::default(), Mutex::default());
+    let world = Arc::new(World { clock, faults: faults.to_vec(), cancel, flips });
     let panel = Panel {
         world: world.clone(),
         info: ProjectorInfo {
@@ -489,7 +494,7 @@ fn run_judged(faults: &[Fault], mut judge: Script) -> Run {
     let result = capture(
         &mut panel,
         &mut eye,
-        &world.clock,
+        &*world.clock,
         &plan,
         &mut judge,
         &mut |step| {
@@ -512,20 +517,24 @@ fn run_judged(faults: &[Fault], mut judge: Script) -> Run {
 fn run(faults: &[Fault]) -> Run {
     let run = run_judged(faults, Script::default());
     assert_eq!(run.disarmed, 1, "disarmed once");
-    if let Ok(record) = run.result.as_ref()
-        && !run.findings().contains(&"stale-frame")
-    {
+    if let Ok(record) = &run.result {
         assert_proven(record);
     }
     run
 }
 
-/// Each frame shows its own slide and nothing else, as the rig itself knows.
+/// Each frame shows its own slide and nothing else, as the rig itself knows; but for references that are reported.
 fn assert_proven(record: &CaptureRecord) {
     let roles = sequence().roles;
     assert_eq!(record.frames.iter().map(|captured| captured.role).collect::<Vec<_>>(), roles);
     for (step, captured) in record.frames.iter().enumerate() {
-        assert_eq!(value(&captured.frame), step as u16, "{}", captured.role);
+        let reported = record.notes.findings.iter().any(|f| f.role == Some(captured.role) && step >= 12);
+        assert!(
+            value(&captured.frame) == step as u16 || reported,
+            "{} shows {:?}",
+            captured.role,
+            captured.frame
+        );
         assert_eq!(captured.receipt.slide, Some(step as u32));
         assert_eq!(captured.frame.stamp.exposure_start, captured.triggered);
     }
@@ -558,6 +567,20 @@ fn a_healthy_rig_is_captured_at_the_display_s_own_pace() {
     assert_eq!(run.progress[0], "started 14");
     assert_eq!(run.progress.iter().filter(|line| line.starts_with("accepted")).count(), 14);
     assert!(run.progress.contains(&"row-1-inverse 12/14".to_string()));
+}
+
+#[test]
+fn a_capture_in_real_time_is_proven_like_one_in_virtual_time() {
+    let (world, mut panel, mut eye) = rig_on(Arc::new(MonotonicClock::start()), &[Fault::Drop(4)]);
+    let polarization = Polarization::green_horizontal();
+    let plan = Plan::new(sequence(), polarization, &panel.info, applied(), &PlanOptions::default()).unwrap();
+    let mut judge = Script::default();
+    let record =
+        capture(&mut panel, &mut eye, &*world.clock, &plan, &mut judge, &mut |_| {}, &world.cancel).unwrap();
+    assert_proven(&record);
+    assert_eq!(record.retaken.len(), 1);
+    // Two frames more than planned and one wait for a lost frame; a busy machine may take longer.
+    assert!(record.seconds > plan.expected().as_secs_f64() + 0.25);
 }
 
 #[test]
@@ -701,6 +724,14 @@ fn a_projector_that_dies_is_reported_and_so_is_that_it_is_not_black() {
 }
 
 #[test]
+fn black_does_not_wait_for_what_was_still_to_be_judged() {
+    // The first pair is complete when the slide after it fails.
+    let run = run(&[Fault::ProjectorGone(4)]);
+    assert_eq!(run.failure().partial.frames.len(), 4);
+    assert!(run.judge.judged.is_empty());
+}
+
+#[test]
 fn black_is_tried_twice_and_its_failure_does_not_cost_the_frames() {
     let once = run(&[Fault::NoBlack(1)]);
     assert!(once.ends_black() && once.findings().is_empty());
@@ -754,7 +785,7 @@ fn cancelled_before_it_begins_it_shows_nothing() {
     let polarization = Polarization::green_horizontal();
     let plan = Plan::new(sequence(), polarization, &panel.info, applied(), &PlanOptions::default()).unwrap();
     let mut judge = Script::default();
-    let result = capture(&mut panel, &mut eye, &world.clock, &plan, &mut judge, &mut |_| {}, &world.cancel);
+    let result = capture(&mut panel, &mut eye, &*world.clock, &plan, &mut judge, &mut |_| {}, &world.cancel);
     assert_eq!(result.unwrap_err().error.reason(), "cancelled");
     assert_eq!((panel.shows, panel.blacks, eye.disarmed), (0, 1, 1));
 }
@@ -801,7 +832,7 @@ fn a_judge_that_panics_leaves_the_projector_black_and_the_camera_idle() {
     let plan = Plan::new(sequence(), polarization, &panel.info, applied(), &PlanOptions::default()).unwrap();
     let mut judge = Script { panics: true, ..Script::default() };
     let result = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| {
-        capture(&mut panel, &mut eye, &world.clock, &plan, &mut judge, &mut |_| {}, &world.cancel)
+        capture(&mut panel, &mut eye, &*world.clock, &plan, &mut judge, &mut |_| {}, &world.cancel)
     }));
     assert!(result.is_err());
     assert_eq!((panel.blacks, eye.disarmed, eye.armed), (1, 1, false));

@@ -63,6 +63,9 @@ fn the_flip_of_a_wrong_slide_cannot_be_claimed_again() {
     assert_eq!(enter(&mut flips, receipt(2, 14), 13), Some("wrong-slide"));
     assert_eq!(enter(&mut flips, receipt(3, 14), 14), Some("stale-receipt"));
     assert_eq!(enter(&mut flips, receipt(3, 15), 14), None);
+    // Also where refreshes are not counted.
+    let uncounted = PresentReceipt { refresh: None, ..receipt(3, 15) };
+    assert_eq!(enter(&mut flips, uncounted, 15), Some("stale-receipt"));
 }
 
 #[test]
@@ -144,6 +147,13 @@ fn a_late_frame_of_a_lost_trigger_is_told_from_the_awaited_one() {
     assert_eq!(camera.lose().trigger().frame(0, 0, -100), Some("stale-frame"));
     assert_eq!(camera.frame(1, 1, 0), None);
     assert_eq!(camera.trigger().frame(3, 2, 0), Some("lost-frame"), "the late frame settled the account");
+}
+
+#[test]
+fn of_two_lost_frames_one_may_come_late_and_the_other_never() {
+    let mut camera = Camera::new(true);
+    assert_eq!(camera.lose().lose().trigger().frame(0, 0, -200), Some("stale-frame"));
+    assert_eq!(camera.frame(2, 2, 0), None);
 }
 
 #[test]

@@ -91,7 +91,7 @@ pub enum Action {
         /// Index into the plan's groups.
         group: usize,
     },
-    /// The group will be taken again: a notice, [`Machine::retaken`] has it.
+    /// The group will be taken again: a notice, [`Machine::retaken`](super::Machine::retaken) has it.
     Retake(GroupRetake),
     /// Leave the projector black.
     Black,
