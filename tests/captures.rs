@@ -217,9 +217,7 @@ impl Decode<'_> {
         let name = &self.capture.name;
         let mask = Npy::read(&self.out.join("maps.npz"), "mask");
         for (map, suffix) in [("column", "col"), ("row", "row")] {
-            let path = self.captures.join(format!("{prefix}_{suffix}_u16.png"));
-            let reference =
-                image::open(&path).unwrap_or_else(|e| panic!("{}: {e}", path.display())).into_luma16();
+            let reference = self.capture.reference(&format!("{prefix}_{suffix}_u16.png"));
             let decoded = Npy::read(&self.out.join("maps.npz"), map);
             let (width, height) = reference.dimensions();
             assert_eq!(decoded.shape, [height as usize, width as usize], "{}: shape of {map}", name);
