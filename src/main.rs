@@ -1,3 +1,7 @@
 //! Entry point of the `polscan` program.
 
-fn main() {}
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
+    ExitCode::from(polscan::cli::run())
+}

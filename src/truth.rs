@@ -1,5 +1,7 @@
 //! What a simulated rig knows of its own scene, pixel by pixel. Absent for every other rig.
 
+use serde::{Deserialize, Serialize};
+
 use crate::grid::Grid;
 
 /// Truth of one camera view. NaN where the pixel sees nothing or no projector light reaches it.
@@ -18,7 +20,7 @@ pub struct Truth {
 }
 
 /// One object of a simulated scene.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct TruthObject {
     /// Name in the scene file.
     pub name: String,

@@ -8,6 +8,6 @@ mod code;
 mod raster;
 mod sequence;
 
-pub use code::{AxisCode, CodeError};
-pub use raster::{ChannelSet, Picture, Polarization, Raster, Rgb};
+pub use code::{AxisCode, CodeError, MAX_BITS, MAX_SIDE};
+pub use raster::{ChannelSet, Picture, Polarization, PolarizationError, Raster, Rgb};
 pub use sequence::{Axis, Mode, ProjectorSize, Role, Sequence};

@@ -1,6 +1,19 @@
 //! From projector coordinates to points.
 
-use crate::{decode::Class, grid::Grid};
+mod plane;
+mod ply;
+mod reconstruct;
+mod surface;
+
+pub use plane::{PlaneError, PlaneFit, fit_plane};
+pub use ply::{CloudFrame, PlyError, PlyPoint, read_ply, write_ply};
+pub use reconstruct::{
+    DEFAULT_ROW_GATE_PX, ReconstructError, ReconstructSettings, reconstruct, reconstruct_with,
+};
+
+use nalgebra::Vector3;
+
+use crate::{decode::Class, geometry::Pose, grid::Grid};
 
 /// What limits a point besides noise; bits of the PLY property `flags`.
 pub mod flag {
@@ -29,18 +42,43 @@ pub struct Cloud {
     pub flags: Grid<u8>,
 }
 
+impl Cloud {
+    /// Number of points.
+    pub fn points(&self) -> usize {
+        self.point_mm.data().iter().filter(|p| p[2].is_finite()).count()
+    }
+
+    /// The same points and normals in another frame, such as the world's by `world_from_camera`. `sigma_z_mm` stays
+    /// along the camera's axis: it is what the measurement knows.
+    pub fn transformed(&self, pose: &Pose) -> Self {
+        let apply = |v: [f32; 3], offset: Vector3<f64>| {
+            let v = Vector3::new(f64::from(v[0]), f64::from(v[1]), f64::from(v[2]));
+            let out = pose.rotation * v + offset;
+            [out.x as f32, out.y as f32, out.z as f32]
+        };
+        Self {
+            point_mm: self.point_mm.map(|&p| apply(p, pose.translation_mm)),
+            normal: self.normal.map(|&n| apply(n, Vector3::zeros())),
+            sigma_z_mm: self.sigma_z_mm.clone(),
+            flags: self.flags.clone(),
+        }
+    }
+}
+
 /// How well rows agree with what columns and calibration predict.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RowCheck {
-    /// Median of measured minus predicted row, in projector px.
+    /// Median of measured minus predicted row, in projector px. Where the baseline is not horizontal this is the
+    /// signed distance of the measured projector pixel from the camera pixel's epipolar line.
     pub median_px: f64,
     /// 1.4826 times the median absolute deviation of the same, in projector px.
     pub sigma_px: f64,
-    /// Gate that was applied, in projector px.
+    /// Gate that was applied, in projector px; a pixel with larger noise is allowed three sigma of it.
     pub gate_px: f64,
     /// Share of the otherwise valid pixels that the gate rejected.
     pub rejected_share: f64,
-    /// How far the predicted row moves per column of error, in px/px (median): the power of the gate on columns.
+    /// How far the predicted row moves per column of error, in px/px (median, unsigned): the power of the gate on
+    /// columns. From 0.1 on, rows are weighed into the depth.
     pub rows_per_column: f64,
 }
 

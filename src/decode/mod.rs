@@ -3,9 +3,25 @@
 //! [`Accumulator`] takes frames in any order as they arrive and keeps handles to them, so that memory holds each
 //! frame once; [`Accumulator::finish`] walks the image in bands of rows and touches each band of all planes once.
 
+mod accumulate;
+mod contrast;
+mod gates;
+mod noise;
+mod pair_sum;
+mod plan;
+mod sample;
+mod subpixel;
 mod types;
+mod words;
 
+pub use accumulate::Accumulator;
+pub use contrast::{Contrast, contrast};
+pub use gates::BoundaryCheck;
+pub use pair_sum::{PairContext, estimate_noise, pair_residual};
 pub use types::{
     AxisMap, CameraResponse, Class, DecodeError, DecodeSettings, Decoded, NoiseModel, PairResidual, Plane,
     PlaneSource, SharedPlane, Thresholds,
 };
+
+#[cfg(test)]
+mod tests;

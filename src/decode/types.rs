@@ -6,6 +6,7 @@ use polscan_patterns::{Axis, AxisCode, Mode, Role};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
+use super::gates::BoundaryCheck;
 use crate::grid::Grid;
 
 /// Samples of one frame, row-major, in DN, significant bits right-aligned.
@@ -21,6 +22,18 @@ pub enum Plane<'a> {
 pub trait PlaneSource: Send + Sync {
     /// The samples; the same at every call.
     fn plane(&self) -> Plane<'_>;
+}
+
+impl PlaneSource for Vec<u8> {
+    fn plane(&self) -> Plane<'_> {
+        Plane::U8(self)
+    }
+}
+
+impl PlaneSource for Vec<u16> {
+    fn plane(&self) -> Plane<'_> {
+        Plane::U16(self)
+    }
 }
 
 /// Noise of a linear camera: `var(I) = read_noise_dn^2 + gain_dn_per_electron * I + 1/12`, I in DN above black.
@@ -149,10 +162,12 @@ impl Class {
     }
 }
 
-/// Result of one axis. Values are meaningful only where the class says so; elsewhere NaN and -1.
+/// Result of one axis. Coordinates and sigmas are NaN wherever the class is not a valid one.
 #[derive(Debug, Clone, PartialEq)]
 pub struct AxisMap {
-    /// Integer index decoded from the word, -1 where there is none.
+    /// Integer index decoded from the word, -1 where there is none. Pixels that only a gate over their neighbourhood
+    /// rejected (`OffBoundary`, `Vote`, `Interreflection`) keep theirs, so that a gate's effect can be measured: the
+    /// class alone says whether a pixel is valid.
     pub code: Grid<i32>,
     /// Sub-pixel projector coordinate, pixel centres at integers.
     pub coordinate: Grid<f32>,
@@ -208,6 +223,8 @@ pub struct Decoded {
     pub black_level_dn: f64,
     /// Residual of each pair in order of axis and bit.
     pub pairs: Vec<PairResidual>,
+    /// Crossings of each bit at legal and illegal places, in order of axis and bit.
+    pub boundaries: Vec<BoundaryCheck>,
     /// Last minus first reference, median over lit pixels as a share of the modulation, where there are two.
     pub drift: Option<f64>,
     /// What was lost by missing frames, in words.
@@ -217,6 +234,12 @@ pub struct Decoded {
 /// Why frames cannot be decoded.
 #[derive(Debug, Clone, PartialEq, Error)]
 pub enum DecodeError {
+    /// Settings that no frames can be decoded with.
+    #[error("decode settings cannot be used: {reason}")]
+    Settings {
+        /// What is wrong and what would be right.
+        reason: String,
+    },
     /// A plane has the wrong number of samples.
     #[error("frame {role} has {found} samples, expected {expected}")]
     Size {

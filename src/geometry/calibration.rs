@@ -1,6 +1,7 @@
-//! The calibration of a rig.
+//! The calibration of a rig: what it holds, and whether it can be used.
 
 use nalgebra::{Matrix3, Vector3};
+use thiserror::Error;
 
 use super::Lens;
 
@@ -11,6 +12,56 @@ pub struct Pose {
     pub rotation: Matrix3<f64>,
     /// In mm.
     pub translation_mm: Vector3<f64>,
+}
+
+/// How far an element of `R^T R` may lie from the identity: numbers printed with six digits pass.
+const ROTATION_TOLERANCE: f64 = 1e-5;
+/// A shorter baseline is a translation in metres, or none at all.
+const MIN_BASELINE_MM: f64 = 1.0;
+/// A longer translation is diverged or in another unit.
+const MAX_TRANSLATION_MM: f64 = 1e6;
+
+impl Pose {
+    /// `rotation * point + translation_mm`.
+    pub fn transform(&self, point_mm: &Vector3<f64>) -> Vector3<f64> {
+        self.rotation * point_mm + self.translation_mm
+    }
+
+    /// The pose that undoes this one.
+    pub fn inverse(&self) -> Self {
+        let back = self.rotation.transpose();
+        Self { rotation: back, translation_mm: -(back * self.translation_mm) }
+    }
+
+    /// Everything that makes the pose unusable; `name` as in files, such as `projector_from_camera`.
+    pub fn faults(&self, name: &str) -> Vec<String> {
+        let mut faults = Vec::new();
+        if let Some(value) = self.rotation.iter().find(|v| !v.is_finite()) {
+            faults.push(format!("{name} rotation holds {value}, not a finite number"));
+        } else {
+            let error = (self.rotation.transpose() * self.rotation - Matrix3::identity()).abs().max();
+            let determinant = self.rotation.determinant();
+            if error > ROTATION_TOLERANCE {
+                faults.push(format!(
+                    "{name} rotation is not orthonormal: R^T R is off the identity by {error:.2e}, \
+                     allowed {ROTATION_TOLERANCE:.0e}"
+                ));
+            } else if determinant < 0.0 {
+                faults.push(format!(
+                    "{name} rotation has determinant {determinant:.3}: it mirrors, an axis is flipped"
+                ));
+            }
+        }
+        let length = self.translation_mm.norm();
+        if let Some(value) = self.translation_mm.iter().find(|v| !v.is_finite()) {
+            faults.push(format!("{name} translation holds {value}, not a finite number"));
+        } else if length > MAX_TRANSLATION_MM {
+            faults.push(format!(
+                "{name} translation is {length:.3e} mm long, expected at most {MAX_TRANSLATION_MM:.0e}"
+            ));
+        }
+        faults
+    }
 }
 
 /// How good a calibration said it was when it was made. All optional.
@@ -48,4 +99,59 @@ pub struct Projector {
     pub lens: Lens,
     /// `x_p = R x_c + t`.
     pub projector_from_camera: Pose,
+}
+
+impl Calibration {
+    /// Everything that makes the calibration unusable; empty when it can be used.
+    pub fn faults(&self) -> Vec<String> {
+        let mut faults = self.camera.faults("camera");
+        if let Some(projector) = &self.projector {
+            faults.extend(projector.lens.faults("projector"));
+            let pose = &projector.projector_from_camera;
+            faults.extend(pose.faults("projector_from_camera"));
+            let baseline = pose.translation_mm.norm();
+            if baseline < MIN_BASELINE_MM {
+                faults.push(format!(
+                    "projector_from_camera translation is {baseline:.4} mm long: without a baseline there is no depth \
+                     (is it in metres?)"
+                ));
+            }
+        }
+        if let Some(world) = &self.world_from_camera {
+            faults.extend(world.faults("world_from_camera"));
+        }
+        faults
+    }
+
+    /// Whether the calibration is of these image sizes, each (width, height). Every disagreement is named.
+    ///
+    /// # Errors
+    /// [`SizeError`] when a size differs; it says so when width and height are exchanged.
+    pub fn check_sizes(&self, camera: (u32, u32), projector: (u32, u32)) -> Result<(), SizeError> {
+        let sizes = [
+            ("camera", Some(self.camera.size()), camera),
+            ("projector", self.projector.map(|p| p.lens.size()), projector),
+        ];
+        let faults: Vec<String> = sizes
+            .into_iter()
+            .filter_map(|(who, calibrated, found)| {
+                let calibrated = calibrated.filter(|&size| size != found)?;
+                let hint =
+                    if calibrated == (found.1, found.0) { ": width and height are exchanged" } else { "" };
+                Some(format!(
+                    "the calibration is of a {who} of {}x{} px, the scan of {}x{} px{hint}",
+                    calibrated.0, calibrated.1, found.0, found.1
+                ))
+            })
+            .collect();
+        if faults.is_empty() { Ok(()) } else { Err(SizeError { faults }) }
+    }
+}
+
+/// A calibration of other image sizes than the scan's.
+#[derive(Debug, Clone, PartialEq, Eq, Error)]
+#[error("cannot use this calibration here: {}; calibrate at the sizes of the scan", faults.join("; "))]
+pub struct SizeError {
+    /// Each disagreement.
+    pub faults: Vec<String>,
 }

@@ -37,6 +37,44 @@ pub struct Retake {
     pub attempt: u32,
 }
 
+/// A reference that was captured again.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ReferenceRetake {
+    /// What it shows.
+    #[serde(flatten)]
+    pub role: Role,
+    /// Slug of the diagnosis that asked for it.
+    pub reason: String,
+    /// Evidence in words.
+    pub evidence: String,
+    /// Which try failed, from 1.
+    pub attempt: u32,
+}
+
+/// Something that was noticed and did not stop the capture.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Finding {
+    /// Slug of the diagnosis.
+    pub reason: String,
+    /// What was shown, where it concerns one picture; the first frame of a pair stands for both.
+    pub role: Option<Role>,
+    /// Evidence in words.
+    pub evidence: String,
+    /// Spread of the residual in units of noise, where it was judged by that.
+    pub sigma: Option<f64>,
+}
+
+/// What a capture noticed besides its frames.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct CaptureNotes {
+    /// Findings that degrade the scan though its frames stand.
+    pub findings: Vec<Finding>,
+    /// Frames that arrived, were not the ones awaited and were dropped: harmless, each is proof that the check works.
+    pub discarded: Vec<Finding>,
+    /// References that were captured again.
+    pub references_retaken: Vec<ReferenceRetake>,
+}
+
 /// A finished capture.
 #[derive(Debug, Clone)]
 pub struct CaptureRecord {
@@ -58,4 +96,6 @@ pub struct CaptureRecord {
     pub applied: AppliedSettings,
     /// Counters of the camera's stream.
     pub statistics: StreamStatistics,
+    /// What was noticed.
+    pub notes: CaptureNotes,
 }

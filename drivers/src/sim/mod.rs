@@ -1,1 +1,51 @@
-//! The simulated rig: a physically true twin of a scanner.
+//! The simulated rig: a physically true twin of a scanner, as an ordinary driver.
+//!
+//! A [`RigDescription`] and a [`Scene`] make a [`Rig`], whose drivers open a camera and a projector like those of any
+//! other rig, and which knows the [`Truth`] of each pixel. How light travels:
+//!
+//! 1. *Panel*: each colour channel leaves the projector linearly polarized, with a finite extinction and a black leak;
+//!    the lens blurs the box of each pixel (exact convolution).
+//! 2. *Time*: a picture is flipped at a refresh, its light follows after the latency, the liquid crystals follow
+//!    exponentially, the lamp may flicker; an exposure integrates all of it analytically into a weighted sum of slides.
+//! 3. *Scene*: per pixel one ray; the surface returns a GGX lobe by Fresnel's laws (as a Mueller matrix, complex index)
+//!    and a depolarising Lambertian part. Shadows are cast by a ray to the projector.
+//! 4. *Camera*: analyser, lens blur and pixel box, shot noise, full well, read noise, gain, black level, quantisation.
+//!
+//! Everything up to the panel's drive is linear and fixed, so it is computed once: a frame is a table look-up and a
+//! product per pixel, then blur and noise. Pixels are sampled at their centres: silhouettes are as sharp as the blur of
+//! the camera leaves them.
+//!
+//! Noise depends on the seed, on the number of the exposure since the rig was made, and on the pixel: never on threads,
+//! regions or the time of day. A fresh rig therefore repeats a scan bit by bit, and a second take on the same rig differs
+//! from the first.
+//!
+//! A rig simulates devices that behave. Faults of the display would come between a request and the timeline
+//! (`projector.rs`, `flip`), faults of the camera between a rendered exposure and its delivery (`camera.rs`,
+//! `next_frame`).
+
+mod camera;
+mod description;
+mod faults;
+mod noise;
+mod optics;
+mod panel;
+mod polarization;
+mod projector;
+mod render;
+mod rig;
+mod scene;
+mod surface;
+#[cfg(test)]
+mod testing;
+mod timeline;
+mod worker;
+mod world;
+
+pub use camera::SimCameras;
+pub use description::{
+    AmbientDescription, AnalyserDescription, CameraDescription, FlickerDescription, Pacing,
+    PanelPolarization, PoseDescription, ProjectorDescription, RigDescription,
+};
+pub use projector::SimProjectors;
+pub use rig::{Rig, RigError, Truth, TruthObject};
+pub use scene::{Material, Object, Plane, Scene, Shape, Sphere, Step, VGroove, Wedge};

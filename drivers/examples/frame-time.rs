@@ -1,0 +1,74 @@
+//! Measures the simulated rig: set-up and rendering of frames at full size.
+//!
+//! `cargo run --release -p polscan-drivers --example frame-time [CONFIG]`, by default config/sim.toml.
+
+use std::{path::Path, time::Instant};
+
+use polscan_drivers::{
+    camera::{CameraDriver, CameraSettings, PixelFormat, TriggerSource},
+    projector::{ProjectorDriver, Slide},
+    sim::{Pacing, Rig, RigDescription, Scene},
+};
+
+#[derive(serde::Deserialize)]
+struct Config {
+    sim: RigDescription,
+}
+
+fn main() -> Result<(), Box<dyn std::error::Error>> {
+    let default = concat!(env!("CARGO_MANIFEST_DIR"), "/../config/sim.toml");
+    let path = std::env::args().nth(1).unwrap_or_else(|| default.to_owned());
+    let mut description = toml::from_str::<Config>(&std::fs::read_to_string(&path)?)?.sim;
+    description.pacing = Pacing::Fast;
+    let scene = Path::new(&path).parent().unwrap_or(Path::new(".")).join(&description.scene);
+    let scene: Scene = toml::from_str(&std::fs::read_to_string(scene)?)?;
+
+    let clock = description.pacing.clock();
+    let start = Instant::now();
+    let rig = Rig::new(&description, &scene, clock.clone())?;
+    println!(
+        "set-up {:.0} ms, {} threads",
+        1e3 * start.elapsed().as_secs_f64(),
+        rayon::current_num_threads()
+    );
+
+    let mut camera = rig.cameras().open(None)?;
+    let mut projector = rig.projectors().open(None)?;
+    let (width, height) = (projector.info().width as usize, projector.info().height as usize);
+    let stripes = |size: usize| (0..size).map(|i| if i / 8 % 2 == 0 { [0, 255, 0] } else { [255, 0, 255] });
+    projector.load(&[
+        Slide::Uniform([0, 255, 0]),
+        Slide::Columns(stripes(width).collect()),
+        Slide::Rows(stripes(height).collect()),
+        Slide::Full(stripes(width * height).collect()),
+    ])?;
+    camera.apply(&CameraSettings {
+        exposure_us: 2000.0,
+        gain_db: 0.0,
+        gamma: description.camera.gamma,
+        region: None,
+        format: PixelFormat::Mono12,
+        trigger: TriggerSource::Software,
+    })?;
+    camera.arm(44)?;
+    for (slide, name, count) in [(0, "uniform", 20), (1, "columns", 40), (2, "rows", 40), (3, "full", 2)] {
+        let shown = projector.show(slide)?;
+        let settled = shown.flipped + std::time::Duration::from_millis(300);
+        clock.sleep_until(settled);
+        let mut times = Vec::new();
+        for _ in 0..count {
+            camera.trigger(clock.now())?;
+            let start = Instant::now();
+            camera.next_frame(std::time::Duration::from_secs(5))?;
+            times.push(1e3 * start.elapsed().as_secs_f64());
+        }
+        times.sort_by(f64::total_cmp);
+        println!(
+            "{name}: best {:.1} ms, median {:.1} ms, worst {:.1} ms",
+            times[0],
+            times[times.len() / 2],
+            times[times.len() - 1]
+        );
+    }
+    Ok(())
+}

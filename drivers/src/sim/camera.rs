@@ -1,0 +1,326 @@
+//! The simulated camera.
+
+use std::{collections::VecDeque, sync::Arc, time::Duration};
+
+use super::{
+    description::{CameraDescription, Pacing},
+    render::{Exposure, Response, full_scale_dn},
+    rig::{Device, Shared, Taken},
+    worker::{Delivery, Job, Worker},
+};
+use crate::{
+    camera::{
+        AppliedSettings, Camera, CameraDriver, CameraInfo, CameraNoise, CameraSettings, Listing, PixelFormat,
+        Region, StreamStatistics, TriggerSource,
+    },
+    clock::Timestamp,
+    error::DeviceError,
+    frame::{Frame, FrameStamp},
+};
+
+const SERIAL: &str = "sim-camera-0";
+const MODEL: &str = "simulated monochrome camera";
+const SHORTEST_EXPOSURE_US: f64 = 1.0;
+const LONGEST_EXPOSURE_US: f64 = 30e6;
+/// Exposure times are whole multiples of this.
+const EXPOSURE_STEP_US: f64 = 1.0;
+const HIGHEST_GAIN_DB: f64 = 48.0;
+
+/// Driver of a simulated rig's camera.
+#[derive(Debug, Clone)]
+pub struct SimCameras {
+    shared: Arc<Shared>,
+}
+
+impl SimCameras {
+    pub(crate) fn new(shared: Arc<Shared>) -> Self {
+        Self { shared }
+    }
+}
+
+impl CameraDriver for SimCameras {
+    fn list(&self) -> Result<Vec<Listing>, DeviceError> {
+        Ok(vec![Listing {
+            driver: "sim".to_owned(),
+            model: MODEL.to_owned(),
+            serial: SERIAL.to_owned(),
+            unusable: None,
+        }])
+    }
+
+    fn open(&self, serial: Option<&str>) -> Result<Box<dyn Camera>, DeviceError> {
+        let taken = self.shared.take(Device::Camera, SERIAL, serial)?;
+        let [sensor_width, sensor_height] = self.shared.description.camera.size;
+        let info = CameraInfo {
+            driver: "sim".to_owned(),
+            model: MODEL.to_owned(),
+            serial: SERIAL.to_owned(),
+            sensor_width,
+            sensor_height,
+            triggered: true,
+        };
+        Ok(Box::new(SimCamera { taken, info, applied: None, stream: None }))
+    }
+}
+
+struct SimCamera {
+    taken: Taken,
+    info: CameraInfo,
+    applied: Option<(AppliedSettings, Response)>,
+    stream: Option<Stream>,
+}
+
+/// A stream between `arm` and `disarm`.
+struct Stream {
+    response: Response,
+    statistics: StreamStatistics,
+    /// End of the latest exposure.
+    busy_until: Option<Timestamp>,
+    pending: Pending,
+}
+
+/// Exposures that have not been delivered.
+enum Pending {
+    /// Rendered when asked for: the clock waits for nobody.
+    Virtual(VecDeque<Job>),
+    /// Rendered on a thread of their own while time goes on.
+    Real(Worker),
+}
+
+impl SimCamera {
+    fn shared(&self) -> &Arc<Shared> {
+        &self.taken.shared
+    }
+
+    fn out_of_order(&self, operation: &'static str, state: &'static str) -> DeviceError {
+        DeviceError::OutOfOrder { device: self.info.serial.clone(), operation, state }
+    }
+
+    fn refused(
+        &self,
+        setting: &'static str,
+        requested: impl ToString,
+        offered: impl ToString,
+    ) -> DeviceError {
+        DeviceError::Refused {
+            device: self.info.serial.clone(),
+            setting,
+            requested: requested.to_string(),
+            offered: offered.to_string(),
+        }
+    }
+
+    fn region(&self, asked: Option<Region>) -> Result<Region, DeviceError> {
+        let (width, height) = (self.info.sensor_width, self.info.sensor_height);
+        let Some(region) = asked else { return Ok(Region { x: 0, y: 0, width, height }) };
+        let fits = |start: u32, size: u32, sensor: u32| size > 0 && start < sensor && size <= sensor - start;
+        if fits(region.x, region.width, width) && fits(region.y, region.height, height) {
+            return Ok(region);
+        }
+        let Region { x, y, width: w, height: h } = region;
+        Err(self.refused(
+            "region",
+            format!("{w} x {h} at ({x}, {y})"),
+            format!("a sensor of {width} x {height}"),
+        ))
+    }
+}
+
+/// Black level and system gain of a format.
+fn response(
+    camera: &CameraDescription,
+    settings: &CameraSettings,
+    region: Region,
+    exposure_us: f64,
+) -> Response {
+    let bits = settings.format.bit_depth();
+    let full_scale = f64::from(full_scale_dn(bits));
+    let black_dn = camera.black_level_share * full_scale;
+    // At 0 dB the full well just fills the converter.
+    let dn_per_electron = (full_scale - black_dn) / camera.full_well_e * 10f64.powf(settings.gain_db / 20.0);
+    Response { region, bits, dn_per_electron, black_dn, gamma: camera.gamma, exposure_us }
+}
+
+impl Camera for SimCamera {
+    fn info(&self) -> &CameraInfo {
+        &self.info
+    }
+
+    fn apply(&mut self, settings: &CameraSettings) -> Result<AppliedSettings, DeviceError> {
+        if self.stream.is_some() {
+            return Err(self.out_of_order("apply", "armed"));
+        }
+        let camera = &self.shared().description.camera;
+        let exposure = settings.exposure_us;
+        if !(SHORTEST_EXPOSURE_US..=LONGEST_EXPOSURE_US).contains(&exposure) {
+            let range = format!("{SHORTEST_EXPOSURE_US} to {LONGEST_EXPOSURE_US}");
+            return Err(self.refused("exposure_us", exposure, range));
+        }
+        if !(0.0..=HIGHEST_GAIN_DB).contains(&settings.gain_db) {
+            return Err(self.refused("gain_db", settings.gain_db, format!("0 to {HIGHEST_GAIN_DB}")));
+        }
+        if settings.gamma != camera.gamma {
+            return Err(self.refused("gamma", settings.gamma, camera.gamma));
+        }
+        if settings.format.bit_depth() > camera.bits {
+            let offered: Vec<String> =
+                [PixelFormat::Mono8, PixelFormat::Mono10, PixelFormat::Mono12, PixelFormat::Mono16]
+                    .iter()
+                    .filter(|format| format.bit_depth() <= camera.bits)
+                    .map(|format| format!("{format:?}"))
+                    .collect();
+            return Err(self.refused("format", format!("{:?}", settings.format), offered.join(", ")));
+        }
+        if settings.trigger != TriggerSource::Software {
+            return Err(self.refused("trigger", "line0", "software: a simulated camera has no lines"));
+        }
+        let region = self.region(settings.region)?;
+        let exposure_us = (exposure / EXPOSURE_STEP_US).round() * EXPOSURE_STEP_US;
+        let response = response(camera, settings, region, exposure_us);
+        let noise = (camera.gamma == 1.0).then(|| CameraNoise {
+            gain_dn_per_electron: response.dn_per_electron,
+            read_noise_dn: camera.read_noise_e * response.dn_per_electron,
+        });
+        let applied = AppliedSettings {
+            settings: CameraSettings { exposure_us, ..settings.clone() },
+            width: region.width,
+            height: region.height,
+            black_level_dn: Some(response.black_dn),
+            saturation_dn: response.full_scale_dn(),
+            readout_us: camera.readout_us,
+            noise,
+        };
+        self.shared().set_region(region);
+        self.applied = Some((applied.clone(), response));
+        Ok(applied)
+    }
+
+    fn arm(&mut self, _frames: usize) -> Result<(), DeviceError> {
+        if self.stream.is_some() {
+            return Err(self.out_of_order("arm", "armed"));
+        }
+        let Some((_, response)) = &self.applied else {
+            return Err(self.out_of_order("arm", "no settings are applied"));
+        };
+        let response = response.clone();
+        let pending = match self.shared().description.pacing {
+            Pacing::Fast => Pending::Virtual(VecDeque::new()),
+            Pacing::RealTime => Pending::Real(Worker::start(self.shared().clone(), response.clone())?),
+        };
+        self.stream =
+            Some(Stream { response, statistics: StreamStatistics::default(), busy_until: None, pending });
+        Ok(())
+    }
+
+    fn trigger(&mut self, at: Timestamp) -> Result<Timestamp, DeviceError> {
+        let shared = self.taken.shared.clone();
+        let Some(stream) = &mut self.stream else {
+            return Err(self.out_of_order("trigger", "not armed"));
+        };
+        let exposure = Duration::from_secs_f64(1e-6 * stream.response.exposure_us);
+        let readout = Duration::from_secs_f64(1e-6 * shared.description.camera.readout_us);
+        let mut timeline = shared.timeline();
+        // The sensor reads one frame out while it exposes the next, but not two at once.
+        let free = stream.busy_until.map_or(Timestamp(0), |end| {
+            end.max(Timestamp((end + readout).0.saturating_sub(exposure.as_nanos() as u64)))
+        });
+        let start = at.max(shared.clock.now()).max(free);
+        let number = shared.next_exposure();
+        timeline.expect(number, start);
+        drop(timeline);
+        let end = start + exposure;
+        let trigger = stream.statistics.triggers;
+        stream.statistics.triggers += 1;
+        stream.busy_until = Some(end);
+        let job = Job { number, trigger, start, end, arrives: end + readout };
+        match &mut stream.pending {
+            Pending::Virtual(jobs) => jobs.push_back(job),
+            Pending::Real(worker) => worker.send(job)?,
+        }
+        Ok(start)
+    }
+
+    fn next_frame(&mut self, timeout: Duration) -> Result<Frame, DeviceError> {
+        let shared = self.taken.shared.clone();
+        let Some(stream) = &mut self.stream else {
+            return Err(self.out_of_order("next_frame", "not armed"));
+        };
+        let delivery = match &mut stream.pending {
+            Pending::Virtual(jobs) => next_virtual(&shared, &stream.response, jobs, timeout),
+            Pending::Real(worker) => worker.next(&shared, timeout),
+        };
+        let Some(Delivery { job, received, store }) = delivery? else {
+            return Err(DeviceError::Timeout {
+                device: self.info.serial.clone(),
+                awaited: "frame",
+                timeout_ms: timeout.as_millis() as u64,
+            });
+        };
+        // Scripted faults of the camera (frames that are lost, late, repeated or damaged) belong here, between the
+        // rendered exposure and its delivery.
+        stream.statistics.frames += 1;
+        Ok(Frame {
+            width: stream.response.region.width,
+            height: stream.response.region.height,
+            bit_depth: stream.response.bits,
+            stamp: FrameStamp {
+                frame_id: job.trigger,
+                trigger: job.trigger,
+                exposure_start: job.start,
+                received,
+                device_time_ns: Some(job.start.0),
+            },
+            store,
+        })
+    }
+
+    fn disarm(&mut self) -> Result<StreamStatistics, DeviceError> {
+        let Some(stream) = self.stream.take() else {
+            return Err(self.out_of_order("disarm", "not armed"));
+        };
+        let left = match stream.pending {
+            Pending::Virtual(jobs) => jobs.into_iter().collect(),
+            Pending::Real(worker) => worker.stop(),
+        };
+        let mut timeline = self.taken.shared.timeline();
+        left.iter().for_each(|job| timeline.dismiss(job.number));
+        Ok(stream.statistics)
+    }
+}
+
+impl Drop for SimCamera {
+    fn drop(&mut self) {
+        // A camera that is not armed has nothing to stop, which is what the error would say.
+        let _ = self.disarm();
+    }
+}
+
+/// Waits on the clock for the next frame and renders it.
+fn next_virtual(
+    shared: &Shared,
+    response: &Response,
+    jobs: &mut VecDeque<Job>,
+    timeout: Duration,
+) -> Result<Option<Delivery>, DeviceError> {
+    let deadline = shared.clock.now() + timeout;
+    let Some(job) = jobs.front().filter(|job| job.arrives <= deadline).cloned() else {
+        shared.clock.sleep_until(deadline);
+        return Ok(None);
+    };
+    jobs.pop_front();
+    shared.clock.sleep_until(job.arrives);
+    let store = expose(shared, response, &job);
+    // The virtual clock does not move while a frame is computed.
+    Ok(Some(Delivery { received: job.arrives, job, store }))
+}
+
+/// Renders an exposure that lies in the past.
+pub(crate) fn expose(shared: &Shared, response: &Response, job: &Job) -> Arc<dyn crate::frame::PixelStore> {
+    let light = {
+        let mut timeline = shared.timeline();
+        let light = timeline.mixture(job.start, job.end);
+        timeline.dismiss(job.number);
+        light
+    };
+    shared.renderer.render(&Exposure { number: job.number, light }, response)
+}

@@ -1,0 +1,236 @@
+//! The rig: what its camera, its projector and the truth have in common.
+
+use std::sync::{
+    Arc, Mutex, MutexGuard, PoisonError,
+    atomic::{AtomicBool, AtomicU64, Ordering},
+};
+
+use thiserror::Error;
+
+use super::{
+    camera::SimCameras, description::RigDescription, panel::Panel, projector::SimProjectors,
+    render::Renderer, scene::Scene, timeline::Timeline, world::World,
+};
+use crate::{camera::Region, clock::Clock, error::DeviceError};
+
+/// Why a rig cannot be built.
+#[derive(Debug, Clone, PartialEq, Error)]
+pub enum RigError {
+    /// Faults of the description, each with its key path.
+    #[error("the simulated rig cannot be built: {}", .0.join("; "))]
+    Description(Vec<String>),
+    /// Faults of the scene, each with its key path.
+    #[error("the scene cannot be built: {}", .0.join("; "))]
+    Scene(Vec<String>),
+    /// A distortion that has no inverse within the picture.
+    #[error(
+        "the distortion of the simulated {which} folds over within its picture; reduce sim.{which}.k1 to k3"
+    )]
+    Lens {
+        /// `camera` or `projector`.
+        which: &'static str,
+    },
+    /// No turn of the projector meets the aim.
+    #[error(
+        "no pose of the projector aims its picture at the camera's axis; change sim.pose.aim_mm or give sim.pose.rotation"
+    )]
+    Aim,
+    /// An object with a level gets no light.
+    #[error(
+        "object `{object}` of the scene has a level, but no pixel sees it in the projector's light; move it or drop its level"
+    )]
+    Dark {
+        /// Name in the scene.
+        object: String,
+    },
+}
+
+/// What the scene truly is, per pixel, row-major.
+#[derive(Debug, Clone)]
+pub struct Truth {
+    /// Columns.
+    pub width: usize,
+    /// Rows.
+    pub height: usize,
+    /// Projector column, pixel centres at integers; NaN where no light of the picture arrives.
+    pub column: Vec<f32>,
+    /// Projector row; NaN like `column`.
+    pub row: Vec<f32>,
+    /// z in the camera's frame in mm, also in shadow; NaN where nothing is seen.
+    pub depth_mm: Vec<f32>,
+    /// Number in `objects`, 255 where nothing is seen.
+    pub object: Vec<u8>,
+    /// Faces of the scene's objects.
+    pub objects: Vec<TruthObject>,
+}
+
+/// A face of a scene's object.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct TruthObject {
+    /// Name in the scene; faces of a composite object have a suffix.
+    pub name: String,
+    /// Whether a plane can be fitted to it.
+    pub planar: bool,
+}
+
+/// What camera, projector and rig share.
+#[derive(Debug)]
+pub(crate) struct Shared {
+    pub(crate) description: RigDescription,
+    pub(crate) clock: Arc<dyn Clock>,
+    pub(crate) renderer: Renderer,
+    timeline: Mutex<Timeline>,
+    /// Exposures since the rig was made.
+    exposures: AtomicU64,
+    /// Region of the latest applied settings.
+    region: Mutex<Option<Region>>,
+    camera_open: AtomicBool,
+    projector_open: AtomicBool,
+}
+
+/// Which of the rig's devices.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Device {
+    Camera,
+    Projector,
+}
+
+impl Shared {
+    pub(crate) fn timeline(&self) -> MutexGuard<'_, Timeline> {
+        self.timeline.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Number of a new exposure.
+    pub(crate) fn next_exposure(&self) -> u64 {
+        self.exposures.fetch_add(1, Ordering::Relaxed)
+    }
+
+    pub(crate) fn set_region(&self, region: Region) {
+        *self.region.lock().unwrap_or_else(PoisonError::into_inner) = Some(region);
+    }
+
+    fn flag(&self, device: Device) -> &AtomicBool {
+        match device {
+            Device::Camera => &self.camera_open,
+            Device::Projector => &self.projector_open,
+        }
+    }
+
+    /// Takes a device, which only one may have.
+    pub(crate) fn take(
+        self: &Arc<Self>,
+        device: Device,
+        serial: &str,
+        asked: Option<&str>,
+    ) -> Result<Taken, DeviceError> {
+        if let Some(asked) = asked.filter(|asked| *asked != serial) {
+            return Err(DeviceError::Unavailable {
+                device: asked.to_owned(),
+                detail: format!("the simulated rig has only {serial}; select that or nothing"),
+            });
+        }
+        if self.flag(device).swap(true, Ordering::AcqRel) {
+            return Err(DeviceError::Unavailable {
+                device: serial.to_owned(),
+                detail: "is open already; close it first".to_owned(),
+            });
+        }
+        Ok(Taken { shared: self.clone(), device })
+    }
+}
+
+/// A taken device; dropping gives it back.
+#[derive(Debug)]
+pub(crate) struct Taken {
+    pub(crate) shared: Arc<Shared>,
+    device: Device,
+}
+
+impl Drop for Taken {
+    fn drop(&mut self) {
+        self.shared.flag(self.device).store(false, Ordering::Release);
+    }
+}
+
+/// A simulated rig. Its drivers and devices share its clock and its state.
+#[derive(Debug, Clone)]
+pub struct Rig {
+    shared: Arc<Shared>,
+}
+
+impl Rig {
+    /// Builds a rig around a scene. `clock` is the one that everything on the rig runs by, see
+    /// [`super::Pacing::clock`].
+    pub fn new(description: &RigDescription, scene: &Scene, clock: Arc<dyn Clock>) -> Result<Self, RigError> {
+        let faults = description.validate();
+        if !faults.is_empty() {
+            return Err(RigError::Description(faults));
+        }
+        let faults = scene.validate();
+        if !faults.is_empty() {
+            return Err(RigError::Scene(faults));
+        }
+        let panel = Panel::new(&description.projector);
+        let world = World::new(description, scene, &panel)?;
+        let shared = Shared {
+            description: description.clone(),
+            clock,
+            renderer: Renderer::new(description, world, panel),
+            timeline: Mutex::new(Timeline::new(description)),
+            exposures: AtomicU64::new(0),
+            region: Mutex::default(),
+            camera_open: AtomicBool::new(false),
+            projector_open: AtomicBool::new(false),
+        };
+        Ok(Self { shared: Arc::new(shared) })
+    }
+
+    /// Driver of the rig's one camera.
+    pub fn cameras(&self) -> SimCameras {
+        SimCameras::new(self.shared.clone())
+    }
+
+    /// Driver of the rig's one projector.
+    pub fn projectors(&self) -> SimProjectors {
+        SimProjectors::new(self.shared.clone())
+    }
+
+    /// What the camera truly sees, cropped to the region that was applied last.
+    pub fn truth(&self) -> Truth {
+        self.truth_of(*self.shared.region.lock().unwrap_or_else(PoisonError::into_inner))
+    }
+
+    /// What the camera truly sees in a region (clipped to the sensor), `None` for the whole sensor.
+    pub fn truth_of(&self, region: Option<Region>) -> Truth {
+        let world = self.shared.renderer.world();
+        let [sensor_width, sensor_height] = self.shared.description.camera.size;
+        let whole = Region { x: 0, y: 0, width: sensor_width, height: sensor_height };
+        let region = region.unwrap_or(whole);
+        let end = |start: u32, size: u32, sensor: u32| start.saturating_add(size).min(sensor) as usize;
+        let columns = region.x as usize..end(region.x, region.width, sensor_width);
+        let rows = region.y as usize..end(region.y, region.height, sensor_height);
+        let mut truth = Truth {
+            width: columns.len(),
+            height: rows.len(),
+            column: Vec::new(),
+            row: Vec::new(),
+            depth_mm: Vec::new(),
+            object: Vec::new(),
+            objects: world
+                .faces
+                .iter()
+                .map(|(name, planar)| TruthObject { name: name.clone(), planar: *planar })
+                .collect(),
+        };
+        for y in rows {
+            let start = (y + world.border) * world.width + world.border;
+            for sight in &world.sights[start + columns.start..start + columns.end.max(columns.start)] {
+                truth.column.push(sight.at[0]);
+                truth.row.push(sight.at[1]);
+                truth.depth_mm.push(sight.depth_mm);
+                truth.object.push(sight.face);
+            }
+        }
+        truth
+    }
+}

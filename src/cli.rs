@@ -1,0 +1,174 @@
+//! The command line: arguments in, exit code out. What the commands do lives in `commands`.
+
+use std::path::PathBuf;
+
+use clap::{Args, Parser, Subcommand};
+use polscan_patterns::Mode;
+
+use crate::{
+    commands::{self, Failure},
+    config::{Layers, Override},
+    report::NamedRegion,
+};
+
+/// 3D scanner for objects too shiny and too black for ordinary structured light.
+#[derive(Debug, Parser)]
+#[command(name = "polscan", version, max_term_width = 100)]
+struct Cli {
+    /// Print one machine-readable object to stdout; progress and logs stay on stderr.
+    #[arg(long, global = true)]
+    json: bool,
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    /// Scan once on the configured rig and write a bundle.
+    Scan(Scan),
+    /// Decode recorded frames, our own or foreign ones.
+    Decode(Decode),
+    /// Write the pattern images as PNG, with the manifest that describes them.
+    Patterns(Patterns),
+    /// List cameras and projectors, usable or not.
+    Devices(ConfigArgs),
+    /// Report every fault of a configuration.
+    CheckConfig {
+        /// Configuration file.
+        file: PathBuf,
+    },
+}
+
+#[derive(Debug, Args)]
+struct ConfigArgs {
+    /// Configuration file; what it leaves out is as in config/default.toml.
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
+}
+
+#[derive(Debug, Args)]
+struct Scan {
+    #[command(flatten)]
+    config: ConfigArgs,
+    /// pse, fast, paper or gray.
+    #[arg(long)]
+    mode: Option<Mode>,
+    /// Exposure time in microseconds.
+    #[arg(long, value_name = "US")]
+    exposure_us: Option<f64>,
+    /// Rectangle of the camera image to measure as a plane, as NAME=x,y,width,height. May be repeated.
+    #[arg(long, value_name = "NAME=X,Y,W,H")]
+    region: Vec<NamedRegion>,
+    /// Folder for the result; must be absent or empty.
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+}
+
+#[derive(Debug, Args)]
+struct Decode {
+    /// Folder with manifest.json and the frames, or the manifest itself.
+    bundle: PathBuf,
+    /// Calibration to use instead of the bundle's own.
+    #[arg(long, value_name = "FILE")]
+    calibration: Option<PathBuf>,
+    /// Bouguet stereo results only: the projector is the left device, the camera the right one.
+    #[arg(long)]
+    projector_left: bool,
+    /// Decode in another mode than the one recorded.
+    #[arg(long)]
+    mode: Option<Mode>,
+    /// Rectangle of the camera image to measure as a plane, as NAME=x,y,width,height. May be repeated.
+    #[arg(long, value_name = "NAME=X,Y,W,H")]
+    region: Vec<NamedRegion>,
+    /// Folder for the result; must be absent or empty.
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+}
+
+#[derive(Debug, Args)]
+struct Patterns {
+    #[command(flatten)]
+    config: ConfigArgs,
+    /// pse, fast, paper or gray.
+    #[arg(long)]
+    mode: Mode,
+    /// Projector size as WIDTHxHEIGHT, each 1 to 8192; the configured projector's where it is left out.
+    #[arg(long, value_name = "WxH")]
+    size: Option<commands::Size>,
+    /// Folder for the images; must be absent or empty.
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+}
+
+fn layers(args: &ConfigArgs, flags: Vec<Override>) -> Layers {
+    let mut overrides = Override::from_environment(environment());
+    overrides.extend(flags);
+    Layers { file: args.config.clone(), overrides }
+}
+
+/// The environment, without variables that are not text: none of ours is.
+fn environment() -> impl Iterator<Item = (String, String)> {
+    std::env::vars_os()
+        .filter_map(|(name, value)| Some((name.into_string().ok()?, value.into_string().ok()?)))
+}
+
+/// Runs the program and returns its exit code.
+pub fn run() -> u8 {
+    let cli = match Cli::try_parse() {
+        Ok(cli) => cli,
+        Err(error) => {
+            // Help and version are no errors; clap prints each to its own stream.
+            let code = if error.use_stderr() { commands::USAGE } else { 0 };
+            let _ = error.print();
+            return code;
+        }
+    };
+    start_logging();
+    match dispatch(&cli) {
+        Ok(code) => code,
+        Err(failure) => {
+            commands::print_failure(&failure, cli.json);
+            failure.code()
+        }
+    }
+}
+
+/// Logs go to stderr; POLSCAN_LOG chooses what, as in `POLSCAN_LOG=polscan=debug`.
+fn start_logging() {
+    let filter = tracing_subscriber::EnvFilter::try_from_env("POLSCAN_LOG")
+        .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("warn"));
+    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).without_time().init();
+}
+
+fn dispatch(cli: &Cli) -> Result<u8, Failure> {
+    match &cli.command {
+        Command::Scan(args) => {
+            let mut flags = Vec::new();
+            flags.extend(args.mode.map(|mode| Override::flag("--mode", "scan.mode", mode.name())));
+            flags
+                .extend(args.exposure_us.map(|us| Override::flag("--exposure-us", "camera.exposure_us", us)));
+            let settings = layers(&args.config, flags).load()?;
+            commands::scan(&settings, &args.region, &args.out, cli.json)
+        }
+        Command::Decode(args) => commands::decode(&commands::DecodeArgs {
+            bundle: &args.bundle,
+            calibration: args.calibration.as_deref(),
+            projector_left: args.projector_left,
+            mode: args.mode,
+            regions: &args.region,
+            out: &args.out,
+            json: cli.json,
+        }),
+        Command::Patterns(args) => {
+            let settings = layers(&args.config, Vec::new()).load()?;
+            commands::patterns(&settings, args.mode, args.size, &args.out, cli.json)
+        }
+        Command::Devices(args) => commands::devices(&layers(args, Vec::new()).load()?, cli.json),
+        Command::CheckConfig { file } => {
+            let args = ConfigArgs { config: Some(file.clone()) };
+            layers(&args, Vec::new()).load()?;
+            commands::config_is_good(file, cli.json);
+            Ok(0)
+        }
+    }
+}

@@ -1,0 +1,163 @@
+//! `polscan decode`: recorded frames, ours or foreign, to maps, cloud and report.
+
+use std::{path::Path, time::Instant};
+
+use polscan_patterns::{Mode, ProjectorSize, Role, Sequence};
+
+use super::{
+    Failure,
+    results::{self, Results},
+};
+use crate::{
+    cloud::ReconstructSettings,
+    geometry::{Calibration, ReadHints},
+    pipeline::{self, Context, Job, PipelineError},
+    report::{CaptureSummary, NamedRegion, Timings, Verdict},
+    store::{
+        Bundle, BundleWriter, FrameSet, Limits, Manifest, Policy,
+        manifest::{Capture, Processing, Volume},
+    },
+};
+
+/// Volume of a capture that states none: no limit but that points lie in front of the camera.
+const UNBOUNDED: Volume = Volume { near_mm: 1e-3, far_mm: 1e9 };
+
+/// What the command line asks for.
+pub struct DecodeArgs<'a> {
+    /// Folder with manifest.json, or the manifest itself.
+    pub bundle: &'a Path,
+    /// Calibration that comes before the bundle's own.
+    pub calibration: Option<&'a Path>,
+    /// Whether the first device of a stereo result is the projector.
+    pub projector_left: bool,
+    /// Mode that comes before the bundle's own.
+    pub mode: Option<Mode>,
+    /// Regions to measure; those of the bundle where there are none.
+    pub regions: &'a [NamedRegion],
+    /// Folder for the result.
+    pub out: &'a Path,
+    /// Whether to print JSON.
+    pub json: bool,
+}
+
+/// Decodes and writes; returns the exit code.
+pub fn decode(args: &DecodeArgs) -> Result<u8, Failure> {
+    let start = Instant::now();
+    let operation = || format!("decode {}", args.bundle.display());
+    let bundle =
+        Bundle::open(args.bundle, Policy::Local, args.mode).map_err(|e| Failure::data(operation(), e))?;
+    // Refused before the work rather than after it.
+    let writer = BundleWriter::create(args.out, Some(bundle.folder()), 0)
+        .map_err(|error| Failure::storage("write the result", error))?;
+    let frames = bundle.frames(&Limits::default()).map_err(|e| Failure::data(operation(), e))?;
+    bundle.verify().map_err(|e| Failure::data(operation(), e))?;
+    let load_ms = start.elapsed().as_secs_f64() * 1e3;
+
+    let (sequence, calibration) =
+        resolve(args, &bundle, &frames).map_err(|e| Failure::data(operation(), e))?;
+    let manifest = bundle.manifest();
+    let processing = manifest.processing.clone().unwrap_or_default();
+    let regions = if args.regions.is_empty() { processing.regions.clone() } else { args.regions.to_vec() };
+    for region in &regions {
+        region.check(frames.width, frames.height).map_err(|e| Failure::data(operation(), e))?;
+    }
+    let volume = processing.volume.unwrap_or(UNBOUNDED);
+    let job = Job {
+        roles: &sequence.roles,
+        planes: &frames.planes,
+        decode: manifest.decode_settings(&sequence, (frames.width, frames.height), frames.sample_bits),
+        calibration: calibration.as_ref(),
+        reconstruct: ReconstructSettings {
+            near_mm: volume.near_mm,
+            far_mm: volume.far_mm,
+            row_gate_px: processing.row_gate_px,
+        },
+    };
+    let outcome = pipeline::run(&job).map_err(|error: PipelineError| Failure::data(operation(), error))?;
+
+    let truth = bundle.truth().map_err(|e| Failure::data(operation(), e))?;
+    let capture = manifest.capture.as_ref().map(|capture| summary(&manifest.sequence, capture));
+    let notes: Vec<String> = bundle.notes().iter().chain(&frames.notes).cloned().collect();
+    let context = Context {
+        truth: truth.as_ref(),
+        capture: capture.as_ref(),
+        found: &[],
+        regions: &regions,
+        simulated: truth.is_some(),
+        notes: &notes,
+    };
+    let results = Results {
+        job: &job,
+        outcome: &outcome,
+        context: &context,
+        timings: Timings { load: Some(load_ms), ..outcome.timings },
+        calibration: calibration.as_ref(),
+        frames: None,
+    };
+    let mut result = Manifest::new(&sequence, bundle.absolute_frames());
+    result.label = manifest.label.clone();
+    result.rig = manifest.rig.clone();
+    result.settings = manifest.settings.clone();
+    result.capture = manifest.capture.clone();
+    result.source = Some(bundle.origin(&frames).map_err(|e| Failure::data(operation(), e))?);
+    result.processing = Some(Processing { regions: regions.clone(), ..processing });
+    let report = results::write(writer, result, &results)?;
+    results::print(&report, args.out, args.json);
+    Ok(if report.verdict == Verdict::Failed { super::failure::FAILED } else { 0 })
+}
+
+/// What a recorded capture says of itself.
+fn summary(sequence: &[Role], capture: &Capture) -> CaptureSummary {
+    let evidence: Vec<_> = sequence
+        .iter()
+        .zip(&capture.frames)
+        .map(|(role, evidence)| (*role, evidence.receipt, evidence.stamp))
+        .collect();
+    CaptureSummary {
+        seconds: capture.seconds,
+        limit_seconds: capture.limit_seconds,
+        latency_ms: capture.latency_ms,
+        hold_frames: capture.hold_refreshes,
+        timing_measured: capture.timing_measured,
+        retaken: capture.retaken.clone(),
+        statistics: capture.statistics,
+        ..CaptureSummary::default()
+    }
+    .with_evidence(&evidence)
+}
+
+/// Sequence and calibration; each may know the projector's size when the other does not.
+fn resolve(
+    args: &DecodeArgs,
+    bundle: &Bundle,
+    frames: &FrameSet,
+) -> Result<(Sequence, Option<Calibration>), Box<dyn std::error::Error + Send + Sync>> {
+    let manifest = bundle.manifest();
+    let mut hints = ReadHints {
+        camera_size: Some((frames.width as u32, frames.height as u32)),
+        swap: args.projector_left,
+        ..ReadHints::default()
+    };
+    hints.projector_size = manifest.projector.map(|size| (size.width, size.height));
+    let calibration = match args.calibration {
+        Some(path) => Some(Calibration::read_with(path, &hints)?),
+        None => match bundle.calibration()? {
+            Some((path, bytes)) => {
+                let name = path.display().to_string();
+                Some(Calibration::from_bytes(&bytes, &name, &hints)?)
+            }
+            None => None,
+        },
+    };
+    let size_of = |calibrated: &Calibration| {
+        let (width, height) = calibrated.projector.as_ref()?.lens.size();
+        Some(ProjectorSize { width, height })
+    };
+    let sequence = manifest.resolve_sequence(args.mode, calibration.as_ref().and_then(size_of))?;
+    if let Some(calibrated) = &calibration {
+        let camera = (frames.width as u32, frames.height as u32);
+        let size = sequence.size();
+        calibrated.check_sizes(camera, (size.width, size.height))?;
+    }
+    Ok((sequence, calibration))
+}

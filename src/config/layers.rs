@@ -1,0 +1,340 @@
+//! Joins defaults, file, environment and flags, and collects every fault on the way.
+
+use std::{
+    fmt,
+    path::{Path, PathBuf},
+};
+
+use thiserror::Error;
+use toml::{Table, Value};
+
+use super::{Raw, Settings};
+
+/// The commented defaults, which are also the manual.
+const DEFAULTS: &str = include_str!("../../config/default.toml");
+
+/// Bound on the faults that one configuration can report.
+const MOST_FAULTS: usize = 200;
+
+/// One thing wrong with a configuration.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Fault {
+    /// Key path such as `camera.exposure_us`; empty where the whole file is meant.
+    pub key: String,
+    /// What is wrong and what is allowed.
+    pub message: String,
+    /// File, variable or flag that set the key, where it was not the default.
+    pub origin: Option<String>,
+}
+
+impl fmt::Display for Fault {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        if !self.key.is_empty() {
+            write!(f, "{}: ", self.key)?;
+        }
+        f.write_str(&self.message)?;
+        match &self.origin {
+            Some(origin) => write!(f, " (set by {origin})"),
+            None => Ok(()),
+        }
+    }
+}
+
+/// A configuration that cannot be used.
+#[derive(Debug, Error)]
+#[error("{} of the configuration cannot be used:\n{}", count(faults.len()), lines(faults))]
+pub struct ConfigError {
+    /// Everything that is wrong with it.
+    pub faults: Vec<Fault>,
+}
+
+fn count(faults: usize) -> String {
+    if faults == 1 { "1 setting".into() } else { format!("{faults} settings") }
+}
+
+fn lines(faults: &[Fault]) -> String {
+    faults.iter().map(|fault| format!("  {fault}")).collect::<Vec<_>>().join("\n")
+}
+
+/// One value from the environment or a flag.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Override {
+    /// Key path such as `scan.mode`.
+    pub key: String,
+    /// Value.
+    pub value: Value,
+    /// Variable or flag, for messages.
+    pub origin: String,
+}
+
+impl Override {
+    /// An override by a command-line flag.
+    pub fn flag(name: &str, key: &str, value: impl Into<Value>) -> Self {
+        Self { key: key.into(), value: value.into(), origin: format!("flag {name}") }
+    }
+
+    /// The overrides among environment variables: those that start with `POLSCAN_` and hold two underscores.
+    pub fn from_environment(variables: impl Iterator<Item = (String, String)>) -> Vec<Self> {
+        let mut found: Vec<_> = variables
+            .filter_map(|(name, text)| {
+                let (table, key) = name.strip_prefix("POLSCAN_")?.split_once("__")?;
+                let key = format!("{table}.{}", key.replace("__", ".")).to_lowercase();
+                Some(Self { key, value: value_of_text(&text), origin: format!("variable {name}") })
+            })
+            .collect();
+        found.sort_by(|a, b| a.key.cmp(&b.key));
+        found
+    }
+}
+
+/// A TOML value where the text is one (`2000`, `true`, `[1, 2]`), else the text itself.
+fn value_of_text(text: &str) -> Value {
+    toml::from_str::<Table>(&format!("value = {text}"))
+        .ok()
+        .and_then(|mut table| table.remove("value"))
+        .unwrap_or_else(|| Value::String(text.into()))
+}
+
+/// The sources of a configuration.
+#[derive(Debug, Default)]
+pub struct Layers {
+    /// File, if any.
+    pub file: Option<PathBuf>,
+    /// Environment, then flags.
+    pub overrides: Vec<Override>,
+}
+
+impl Layers {
+    /// Reads and joins all layers, or reports everything that is wrong with them.
+    pub fn load(&self) -> Result<Settings, ConfigError> {
+        let mut faults = Vec::new();
+        let mut table = defaults();
+        if let Some(path) = &self.file {
+            match read_table(path) {
+                Ok(file) => merge(&mut table, file),
+                Err(fault) => faults.push(fault),
+            }
+        }
+        for change in &self.overrides {
+            if let Err(message) = set(&mut table, &change.key, change.value.clone()) {
+                faults.push(Fault { key: change.key.clone(), message, origin: Some(change.origin.clone()) });
+            }
+        }
+        let raw = self.deserialize(table, &mut faults);
+        let folder = self.file.as_deref().and_then(Path::parent).unwrap_or(Path::new(""));
+        let settings = raw.and_then(|raw| {
+            let mut found = Vec::new();
+            let settings = Settings::validate(raw, folder, &mut found);
+            for (key, message) in found {
+                // A key that already has a fault was put back to its default, so that what follows from it is noise.
+                if !faults.iter().any(|fault| fault.key == key) {
+                    let origin = self.origin_of(&key);
+                    faults.push(Fault { key, message, origin });
+                }
+            }
+            settings
+        });
+        match settings {
+            Some(settings) if faults.is_empty() => Ok(settings),
+            _ => Err(ConfigError { faults }),
+        }
+    }
+
+    fn origin_of(&self, key: &str) -> Option<String> {
+        self.overrides.iter().rev().find(|change| change.key == key).map(|change| change.origin.clone())
+    }
+
+    /// Deserializes the table; each faulty key is reported, put back to its default or removed, and the rest tried again.
+    fn deserialize(&self, mut table: Table, faults: &mut Vec<Fault>) -> Option<Raw> {
+        for _ in 0..MOST_FAULTS {
+            let error = match serde_path_to_error::deserialize::<_, Raw>(Value::Table(table.clone())) {
+                Ok(raw) => return Some(raw),
+                Err(error) => error,
+            };
+            let key = error.path().to_string();
+            let message = error.inner().to_string().lines().next().unwrap_or_default().trim().to_string();
+            let default = get(&defaults(), &key).cloned();
+            let origin = self.origin_of(&key);
+            let unknown = default.is_none();
+            if faults.iter().any(|fault| missing_field(&message, &key).is_some_and(|path| path == fault.key))
+            {
+                return None;
+            }
+            faults.push(Fault { key: key.clone(), message, origin });
+            let mended = match default {
+                Some(default) if get(&table, &key) != Some(&default) => {
+                    set(&mut table, &key, default).is_ok()
+                }
+                _ => unknown && remove(&mut table, &key),
+            };
+            if !mended {
+                return None;
+            }
+        }
+        None
+    }
+}
+
+/// Path of the field that serde found missing in the table at `key`.
+fn missing_field(message: &str, key: &str) -> Option<String> {
+    let field = message.strip_prefix("missing field `")?.strip_suffix('`')?;
+    Some(if key == "." { field.into() } else { format!("{key}.{field}") })
+}
+
+fn defaults() -> Table {
+    toml::from_str(DEFAULTS).expect("the built-in defaults are TOML, which a test holds")
+}
+
+fn read_table(path: &Path) -> Result<Table, Fault> {
+    let origin = Some(path.display().to_string());
+    let text = std::fs::read_to_string(path).map_err(|error| Fault {
+        key: String::new(),
+        message: format!("cannot read the configuration file: {error}; give an existing file to --config"),
+        origin: origin.clone(),
+    })?;
+    toml::from_str(&text).map_err(|error| {
+        let line = error.span().map(|span| text[..span.start.min(text.len())].lines().count().max(1));
+        let place = line.map(|line| format!("line {line}: ")).unwrap_or_default();
+        Fault { key: String::new(), message: format!("not TOML: {place}{}", error.message()), origin }
+    })
+}
+
+fn merge(base: &mut Table, over: Table) {
+    for (key, value) in over {
+        match (base.get_mut(&key), value) {
+            (Some(Value::Table(base)), Value::Table(over)) => merge(base, over),
+            (_, value) => {
+                base.insert(key, value);
+            }
+        }
+    }
+}
+
+fn get<'a>(table: &'a Table, key: &str) -> Option<&'a Value> {
+    let mut parts = key.split('.');
+    let first = table.get(parts.next()?)?;
+    parts.try_fold(first, |value, part| value.as_table()?.get(part))
+}
+
+fn set(table: &mut Table, key: &str, value: Value) -> Result<(), String> {
+    match key.split_once('.') {
+        None => {
+            table.insert(key.into(), value);
+            Ok(())
+        }
+        Some((head, rest)) => table
+            .entry(head)
+            .or_insert_with(|| Value::Table(Table::new()))
+            .as_table_mut()
+            .ok_or_else(|| format!("`{head}` is a value, not a table"))
+            .and_then(|inner| set(inner, rest, value)),
+    }
+}
+
+fn remove(table: &mut Table, key: &str) -> bool {
+    match key.split_once('.') {
+        None => table.remove(key).is_some(),
+        Some((head, rest)) => {
+            table.get_mut(head).and_then(Value::as_table_mut).is_some_and(|inner| remove(inner, rest))
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn load(file: &str, overrides: Vec<Override>) -> Result<Settings, Vec<String>> {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("rig.toml");
+        std::fs::write(&path, file).unwrap();
+        Layers { file: Some(path), overrides }
+            .load()
+            .map_err(|error| error.faults.iter().map(|fault| fault.key.clone()).collect())
+    }
+
+    fn variable(name: &str, value: &str) -> Vec<Override> {
+        Override::from_environment([(name.to_string(), value.to_string())].into_iter())
+    }
+
+    #[test]
+    fn defaults_alone_are_valid() {
+        let settings = Layers::default().load().unwrap();
+        assert_eq!(settings.raw.api.listen, "127.0.0.1:8631");
+        assert_eq!(settings.mode.name(), "pse");
+    }
+
+    #[test]
+    fn file_then_environment_then_flags() {
+        let file = "[scan]\nmode = \"gray\"\n[camera]\nexposure_us = 1000";
+        let settings = load(file, Vec::new());
+        // An integer where a float is meant is what people write.
+        assert_eq!(settings.unwrap().camera.exposure_us, 1000.0);
+        let mut overrides = variable("POLSCAN_SCAN__MODE", "fast");
+        overrides.extend(variable("POLSCAN_CAMERA__EXPOSURE_US", "500.5"));
+        overrides.push(Override::flag("--mode", "scan.mode", "paper"));
+        let settings = load(file, overrides).unwrap();
+        assert_eq!(settings.mode.name(), "paper");
+        assert_eq!(settings.camera.exposure_us, 500.5);
+    }
+
+    #[test]
+    fn all_faults_are_reported_at_once() {
+        let file = r#"
+            typo = 1
+            [scan]
+            mode = "fringe"
+            [camera]
+            exposure_us = -5.0
+            gian_db = 3.0
+            region = { x = 1, y = 2 }
+            [volume]
+            near_mm = 900.0
+            far_mm = 800.0
+            [projector]
+            vertical = "rgb"
+        "#;
+        let mut faults = load(file, Vec::new()).unwrap_err();
+        faults.sort();
+        let expected = [
+            "camera.exposure_us",
+            "camera.gian_db",
+            "camera.region",
+            "projector.vertical",
+            "scan.mode",
+            "typo",
+            "volume.far_mm",
+        ];
+        assert_eq!(faults, expected);
+    }
+
+    #[test]
+    fn unknown_variables_of_our_form_are_errors_and_others_are_ignored() {
+        assert_eq!(load("", variable("POLSCAN_SCAN__MOOD", "gray")).unwrap_err(), ["scan.mood"]);
+        assert!(load("", variable("POLSCAN_LOG", "debug")).is_ok());
+        assert!(load("", variable("OTHER__THING", "1")).is_ok());
+    }
+
+    #[test]
+    fn a_file_that_is_no_toml_names_its_line() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("rig.toml");
+        std::fs::write(&path, "[scan]\nmode = \n").unwrap();
+        let error = Layers { file: Some(path), overrides: Vec::new() }.load().unwrap_err();
+        assert_eq!(error.faults.len(), 1);
+        assert!(error.to_string().contains("line 2"), "{error}");
+    }
+
+    #[test]
+    fn a_fault_of_a_variable_names_the_variable() {
+        let error =
+            Layers { file: None, overrides: variable("POLSCAN_SCAN__MODE", "loud") }.load().unwrap_err();
+        assert!(error.to_string().contains("POLSCAN_SCAN__MODE"), "{error}");
+    }
+
+    #[test]
+    fn a_missing_file_is_one_fault() {
+        let error = Layers { file: Some("/nowhere/rig.toml".into()), overrides: Vec::new() }.load();
+        assert_eq!(error.unwrap_err().faults.len(), 1);
+    }
+}

@@ -1,0 +1,168 @@
+//! The configuration file as it is written: a plain mirror for serde.
+
+use polscan_drivers::{camera::PixelFormat, sim::RigDescription};
+use polscan_patterns::Mode;
+use serde::{Deserialize, Serialize};
+
+/// All tables of the file. `config/default.toml` documents and fills every key but `[sim]`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Raw {
+    /// `[api]`
+    pub api: Api,
+    /// `[store]`
+    pub store: Store,
+    /// `[scan]`
+    pub scan: Scan,
+    /// `[rig]`
+    pub rig: Rig,
+    /// `[volume]`
+    pub volume: Volume,
+    /// `[camera]`
+    pub camera: Camera,
+    /// `[projector]`
+    pub projector: Projector,
+    /// `[capture]`
+    pub capture: Capture,
+    /// `[decode]`
+    pub decode: Decode,
+    /// `[sim]`: the simulated rig, needed by the `sim` drivers.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub sim: Option<RigDescription>,
+}
+
+/// `[api]`
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Api {
+    /// Address and port.
+    pub listen: String,
+}
+
+/// `[store]`
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Store {
+    /// Folder of the scans.
+    pub dir: String,
+}
+
+/// `[scan]`
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Scan {
+    /// Mode where none is asked for.
+    pub mode: Mode,
+}
+
+/// `[rig]`
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Rig {
+    /// Name.
+    pub name: String,
+    /// Path, relative to the configuration file.
+    pub calibration: String,
+}
+
+/// `[volume]`
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Volume {
+    /// Nearest z in mm.
+    pub near_mm: f64,
+    /// Farthest z in mm.
+    pub far_mm: f64,
+}
+
+/// Family of devices.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum DeviceDriver {
+    /// No device.
+    None,
+    /// The simulated rig.
+    Sim,
+}
+
+/// `[camera]`
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Camera {
+    /// Driver.
+    pub driver: DeviceDriver,
+    /// Serial number, empty for the only one.
+    pub serial: String,
+    /// Exposure time in microseconds.
+    pub exposure_us: f64,
+    /// Gain in decibel.
+    pub gain_db: f64,
+    /// Exponent of the response.
+    pub gamma: f64,
+    /// Sample format.
+    pub format: PixelFormat,
+    /// Part of the sensor; empty is all of it.
+    pub region: RegionTable,
+}
+
+/// `region` of `[camera]`: all four keys or none.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct RegionTable {
+    /// First column.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub x: Option<u32>,
+    /// First row.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub y: Option<u32>,
+    /// Columns.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub width: Option<u32>,
+    /// Rows.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub height: Option<u32>,
+}
+
+/// `[projector]`
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Projector {
+    /// Driver.
+    pub driver: DeviceDriver,
+    /// Serial number, empty for the only one.
+    pub serial: String,
+    /// Letters of the horizontally polarized channels.
+    pub horizontal: String,
+    /// Letters of the vertically polarized channels.
+    pub vertical: String,
+    /// Refreshes per pattern, 0 = least.
+    pub hold_refreshes: u32,
+    /// Flip to trigger in ms, 0 = as timing demands.
+    pub trigger_delay_ms: f64,
+}
+
+/// `[capture]`
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Capture {
+    /// Most re-takes of one pair.
+    pub retakes_per_pair: u32,
+    /// Most re-takes of a scan.
+    pub retakes_per_scan: u32,
+}
+
+/// `[decode]`
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Decode {
+    /// Lit gate in sigma.
+    pub lit_sigma: f64,
+    /// Soft-bit gate in sigma.
+    pub soft_bit_sigma: f64,
+    /// Edge snap in projector px.
+    pub snap_px: f64,
+    /// Edges in a local fit.
+    pub fit_edges: usize,
+    /// Row gate in projector px.
+    pub row_gate_px: f64,
+}

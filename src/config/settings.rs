@@ -1,0 +1,213 @@
+//! Validated settings: what the rest of the program works with.
+
+use std::path::{Path, PathBuf};
+
+use polscan_drivers::{
+    camera::{CameraSettings, Region, TriggerSource},
+    sim::{RigDescription, Scene},
+};
+use polscan_patterns::{ChannelSet, Mode, Polarization};
+
+use super::raw::{self, DeviceDriver, Raw};
+use crate::decode::Thresholds;
+
+/// Where the calibration of the rig comes from.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct RigCalibration {
+    /// File, resolved against the folder of the configuration.
+    pub path: PathBuf,
+}
+
+/// Typed settings that passed every check.
+#[derive(Debug, Clone)]
+pub struct Settings {
+    /// The values as written, for the bundle.
+    pub raw: Raw,
+    /// Mode of a scan.
+    pub mode: Mode,
+    /// Calibration, if the rig has one.
+    pub calibration: Option<RigCalibration>,
+    /// What is asked of the camera.
+    pub camera: CameraSettings,
+    /// Channels of each polarization state.
+    pub polarization: Polarization,
+    /// Gates of the decoder.
+    pub thresholds: Thresholds,
+    /// Simulated rig and its scene, where a driver needs it.
+    pub sim: Option<(RigDescription, Scene)>,
+}
+
+/// Collects `(key, message)`.
+type Faults = Vec<(String, String)>;
+
+impl Settings {
+    /// Checks `raw`; paths are relative to `folder`. Pushes every fault; `None` where settings cannot be formed.
+    pub fn validate(raw: Raw, folder: &Path, faults: &mut Faults) -> Option<Self> {
+        check_ranges(&raw, faults);
+        let polarization = polarization(&raw.projector, faults);
+        let region = region(&raw.camera.region, faults);
+        let sim = sim(&raw, folder, faults);
+        let calibration = calibration(&raw.rig.calibration, folder, faults);
+        if !faults.is_empty() {
+            return None;
+        }
+        Some(Self {
+            mode: raw.scan.mode,
+            calibration,
+            camera: CameraSettings {
+                exposure_us: raw.camera.exposure_us,
+                gain_db: raw.camera.gain_db,
+                gamma: raw.camera.gamma,
+                region,
+                format: raw.camera.format,
+                trigger: TriggerSource::Software,
+            },
+            polarization: polarization?,
+            thresholds: Thresholds {
+                lit_sigma: raw.decode.lit_sigma,
+                soft_bit_sigma: raw.decode.soft_bit_sigma,
+                snap_px: raw.decode.snap_px,
+                fit_edges: raw.decode.fit_edges,
+            },
+            sim,
+            raw,
+        })
+    }
+}
+
+fn check_ranges(raw: &Raw, faults: &mut Faults) {
+    let mut within = |key: &str, value: f64, low: f64, high: f64, unit: &str| {
+        if !(low <= value && value <= high) {
+            faults.push((key.into(), format!("{value} is outside {low} to {high}{unit}")));
+        }
+    };
+    within("camera.exposure_us", raw.camera.exposure_us, 1.0, 30e6, " us");
+    within("camera.gain_db", raw.camera.gain_db, 0.0, 48.0, " dB");
+    within("camera.gamma", raw.camera.gamma, 0.1, 5.0, "");
+    within("projector.hold_refreshes", f64::from(raw.projector.hold_refreshes), 0.0, 600.0, " refreshes");
+    within("projector.trigger_delay_ms", raw.projector.trigger_delay_ms, 0.0, 10_000.0, " ms");
+    within("capture.retakes_per_pair", f64::from(raw.capture.retakes_per_pair), 0.0, 100.0, "");
+    within("capture.retakes_per_scan", f64::from(raw.capture.retakes_per_scan), 0.0, 1000.0, "");
+    within("decode.lit_sigma", raw.decode.lit_sigma, 1.0, 100.0, " sigma");
+    within("decode.soft_bit_sigma", raw.decode.soft_bit_sigma, 0.0, 100.0, " sigma");
+    within("decode.snap_px", raw.decode.snap_px, 0.5, 16.0, " px");
+    within("decode.fit_edges", raw.decode.fit_edges as f64, 2.0, 64.0, " edges");
+    within("decode.row_gate_px", raw.decode.row_gate_px, 0.1, 1000.0, " px");
+    within("volume.near_mm", raw.volume.near_mm, 1.0, 1e6, " mm");
+    within("volume.far_mm", raw.volume.far_mm, 1.0, 1e6, " mm");
+    if raw.volume.near_mm >= raw.volume.far_mm {
+        let message = format!("{} is not beyond near_mm = {}", raw.volume.far_mm, raw.volume.near_mm);
+        faults.push(("volume.far_mm".into(), message));
+    }
+    if raw.api.listen.parse::<std::net::SocketAddr>().is_err() {
+        let message = format!("`{}` is not an address and port such as 127.0.0.1:8631", raw.api.listen);
+        faults.push(("api.listen".into(), message));
+    }
+    if raw.store.dir.is_empty() {
+        faults.push(("store.dir".into(), "empty; name a folder".into()));
+    }
+    let pair = [raw.camera.driver, raw.projector.driver];
+    if pair.contains(&DeviceDriver::Sim) && pair.contains(&DeviceDriver::None) {
+        let message = "a simulated camera sees only a simulated projector; set both drivers to sim or none";
+        faults.push(("camera.driver".into(), message.into()));
+    }
+}
+
+fn polarization(raw: &raw::Projector, faults: &mut Faults) -> Option<Polarization> {
+    let before = faults.len();
+    let mut channels = |key: &str, letters: &str| {
+        let mut set = ChannelSet { red: false, green: false, blue: false };
+        for letter in letters.chars() {
+            let channel = match letter {
+                'r' => &mut set.red,
+                'g' => &mut set.green,
+                'b' => &mut set.blue,
+                _ => {
+                    faults.push((key.into(), format!("`{letter}` is none of the channels r, g, b")));
+                    continue;
+                }
+            };
+            if std::mem::replace(channel, true) {
+                faults.push((key.into(), format!("channel `{letter}` is named twice")));
+            }
+        }
+        if letters.is_empty() {
+            faults.push((key.into(), "no channel; name at least one of r, g, b".into()));
+        }
+        set
+    };
+    let horizontal = channels("projector.horizontal", &raw.horizontal);
+    let vertical = channels("projector.vertical", &raw.vertical);
+    if let Some(both) = raw.horizontal.chars().find(|letter| raw.vertical.contains(*letter)) {
+        let message =
+            format!("channel `{both}` is in projector.horizontal too; a channel has one polarization");
+        faults.push(("projector.vertical".into(), message));
+    }
+    (faults.len() == before).then_some(Polarization { horizontal, vertical })
+}
+
+fn region(raw: &raw::RegionTable, faults: &mut Faults) -> Option<Region> {
+    match (raw.x, raw.y, raw.width, raw.height) {
+        (None, None, None, None) => None,
+        (Some(x), Some(y), Some(width), Some(height)) if width > 0 && height > 0 => {
+            Some(Region { x, y, width, height })
+        }
+        _ => {
+            faults
+                .push(("camera.region".into(), "needs x, y, width and height, the last two above 0".into()));
+            None
+        }
+    }
+}
+
+fn calibration(text: &str, folder: &Path, faults: &mut Faults) -> Option<RigCalibration> {
+    if text.is_empty() {
+        return None;
+    }
+    let path = folder.join(text);
+    if !path.is_file() {
+        let message =
+            format!("no file at {}; the path is relative to the configuration file", path.display());
+        faults.push(("rig.calibration".into(), message));
+    }
+    Some(RigCalibration { path })
+}
+
+/// A fault of the rig's description, which begins with its key path.
+fn split_key(fault: String) -> (String, String) {
+    match fault.split_once(": ") {
+        Some((key, message)) => (key.into(), message.into()),
+        None => ("sim".into(), fault),
+    }
+}
+
+fn sim(raw: &Raw, folder: &Path, faults: &mut Faults) -> Option<(RigDescription, Scene)> {
+    let needed = raw.camera.driver == DeviceDriver::Sim;
+    let Some(description) = &raw.sim else {
+        if needed {
+            faults.push(("sim".into(), "missing; the sim drivers need the table [sim]".into()));
+        }
+        return None;
+    };
+    faults.extend(description.validate().into_iter().map(split_key));
+    let path = folder.join(&description.scene);
+    let text = match std::fs::read_to_string(&path) {
+        Ok(text) => text,
+        Err(error) => {
+            faults.push(("sim.scene".into(), format!("cannot read {}: {error}", path.display())));
+            return None;
+        }
+    };
+    match toml::from_str::<Scene>(&text) {
+        Ok(scene) => {
+            let found = scene.validate().into_iter();
+            faults.extend(found.map(|fault| ("sim.scene".into(), format!("{}: {fault}", path.display()))));
+            Some((description.clone(), scene))
+        }
+        Err(error) => {
+            let message = format!("{} is not a scene: {}", path.display(), error.message());
+            faults.push(("sim.scene".into(), message));
+            None
+        }
+    }
+}

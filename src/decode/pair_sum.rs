@@ -1,0 +1,325 @@
+//! The pair sum: a scan's proof that the frames show what was projected (method, section 5).
+//!
+//! Pattern and inverse together light each projector pixel as the two references together do, so
+//! `P + Q - (R_H + R_V)` is noise: `variance = var(P) + var(Q) + var(R_H)/n_H + var(R_V)/n_V`. Where references are
+//! missing, and in mode paper, the mean of all pair sums takes their place; it contains the pair itself, which leaves
+//! `(1 - 1/pairs)` of a pair's variance.
+//!
+//! Looked at are lit pixels without a saturated frame, on rows spread over the image. With few bits the residual
+//! takes few values, on which a median absolute deviation would jump; each is therefore moved by a fixed pseudo-random
+//! part of a step within +-1/2 DN, whose variance of 1/12 DN^2 is counted.
+
+use polscan_patterns::Axis;
+use rayon::prelude::*;
+
+use super::{
+    noise,
+    plan::{Frames, Levels, axis_position},
+    sample::Sample,
+    types::{CameraResponse, Class, NoiseModel, PairResidual, Plane},
+    words::{Gates, PixelMaps},
+};
+
+/// Rows that are looked at.
+const ROWS: usize = 300;
+/// A pixel this near to a stripe edge (in px, along x and y) is not flat.
+const NEAR_EDGE: usize = 2;
+const OUTLIER_SIGMA: f32 = 5.0;
+const BINS_PER_SIGMA: f32 = 64.0;
+const RANGE_SIGMA: f32 = 64.0;
+
+/// What a single pair is checked against, during capture.
+#[derive(Debug, Clone, Copy)]
+pub struct PairContext<'a> {
+    /// Axis of the pair, copied to the result.
+    pub axis: Axis,
+    /// Bit of the pair, copied to the result.
+    pub bit: u8,
+    /// Frame width in pixels.
+    pub width: usize,
+    /// Bright references taken so far (H, white).
+    pub high: &'a [Plane<'a>],
+    /// Dark references taken so far (V, black).
+    pub low: &'a [Plane<'a>],
+    /// Camera; its noise model is not looked at.
+    pub camera: CameraResponse,
+    /// Noise: calibrated, or from [`estimate_noise`].
+    pub noise: NoiseModel,
+    /// Lit gate in sigma of the modulation, as in the decode.
+    pub lit_sigma: f64,
+}
+
+/// Residual of one pair against the references taken so far. `None` where a reference is missing, or frames differ in
+/// type or size. Costs a few milliseconds whatever the size: rows are sampled.
+pub fn pair_residual(p: Plane<'_>, q: Plane<'_>, context: &PairContext<'_>) -> Option<PairResidual> {
+    match p {
+        Plane::U8(_) => typed_residual::<u8>(p, q, context),
+        Plane::U16(_) => typed_residual::<u16>(p, q, context),
+    }
+}
+
+/// Noise of the camera from two or more pairs of frames that sum to the same light (pattern and inverse of coarse
+/// bits; both references are such a pair too), each pair compared with the next. `None` where there is too little.
+pub fn estimate_noise(pairs: &[[Plane<'_>; 2]], width: usize, camera: &CameraResponse) -> Option<NoiseModel> {
+    fn typed<T: Sample>(
+        pairs: &[[Plane<'_>; 2]],
+        width: usize,
+        camera: &CameraResponse,
+    ) -> Option<NoiseModel> {
+        let len = pairs.first()?[0].len();
+        let pairs: Vec<[&[T]; 2]> = pairs
+            .iter()
+            .map(|pair| {
+                Some([T::of(pair[0])?, T::of(pair[1])?]).filter(|pair| pair.iter().all(|p| p.len() == len))
+            })
+            .collect::<Option<_>>()?;
+        noise::from_pairs(
+            &pairs,
+            width,
+            camera.bit_depth,
+            camera.black_level_dn.unwrap_or(0.0),
+            camera.saturation_dn,
+        )
+    }
+    match pairs.first()?[0] {
+        Plane::U8(_) => typed::<u8>(pairs, width, camera),
+        Plane::U16(_) => typed::<u16>(pairs, width, camera),
+    }
+}
+
+/// Counts of residuals.
+struct Tally {
+    bins: Vec<u64>,
+    flat: [u64; 2],
+    edge: [u64; 2],
+}
+
+impl Tally {
+    fn new() -> Self {
+        Self { bins: vec![0; (2.0 * RANGE_SIGMA * BINS_PER_SIGMA) as usize], flat: [0; 2], edge: [0; 2] }
+    }
+
+    fn add(&mut self, residual: f32, flat: bool) {
+        let at = ((residual + RANGE_SIGMA) * BINS_PER_SIGMA).max(0.0) as usize;
+        let last = self.bins.len() - 1;
+        self.bins[at.min(last)] += 1;
+        let kind = if flat { &mut self.flat } else { &mut self.edge };
+        kind[0] += 1;
+        kind[1] += u64::from(residual.abs() > OUTLIER_SIGMA);
+    }
+
+    fn finish(&self, axis: Axis, bit: u8) -> PairResidual {
+        let total: u64 = self.bins.iter().sum();
+        let share = |[all, beyond]: [u64; 2]| if all == 0 { 0.0 } else { beyond as f64 / all as f64 };
+        if total == 0 {
+            let nothing = f64::NAN;
+            return PairResidual {
+                axis,
+                bit,
+                sigma: nothing,
+                median: nothing,
+                flat_outliers: 0.0,
+                edge_outliers: 0.0,
+                pixels: 0,
+            };
+        }
+        let half = total as f64 / 2.0;
+        let mut below = 0.0;
+        let mut median = 0.0;
+        for (index, &count) in self.bins.iter().enumerate() {
+            if below + count as f64 >= half {
+                median = index as f64 + (half - below) / count as f64;
+                break;
+            }
+            below += count as f64;
+        }
+        // Median absolute deviation in bins: the distance that holds half of the counts.
+        let cumulative: Vec<f64> = std::iter::once(0.0)
+            .chain(self.bins.iter().scan(0.0, |sum, &count| {
+                *sum += count as f64;
+                Some(*sum)
+            }))
+            .collect();
+        let rank = |position: f64| {
+            let position = position.clamp(0.0, self.bins.len() as f64);
+            let index = (position as usize).min(self.bins.len() - 1);
+            cumulative[index] + (cumulative[index + 1] - cumulative[index]) * (position - index as f64)
+        };
+        let (mut near, mut far) = (0.0, self.bins.len() as f64);
+        for _ in 0..48 {
+            let middle = (near + far) / 2.0;
+            if rank(median + middle) - rank(median - middle) < half {
+                near = middle;
+            } else {
+                far = middle;
+            }
+        }
+        PairResidual {
+            axis,
+            bit,
+            sigma: 1.4826 * far / f64::from(BINS_PER_SIGMA),
+            median: median / f64::from(BINS_PER_SIGMA) - f64::from(RANGE_SIGMA),
+            flat_outliers: share(self.flat),
+            edge_outliers: share(self.edge),
+            pixels: total,
+        }
+    }
+}
+
+/// Sampled rows of an image of `height` rows.
+fn sampled_rows(height: usize) -> impl Iterator<Item = usize> + Clone {
+    let stride = (height / ROWS).max(1);
+    (stride / 2..height).step_by(stride)
+}
+
+/// A fixed pseudo-random number in [-1/2, 1/2) for pixel `at` (a multiplicative hash).
+fn dither(at: usize) -> f32 {
+    let mut hash = (at as u32).wrapping_mul(0x9E37_79B9);
+    hash = (hash ^ (hash >> 15)).wrapping_mul(0x85EB_CA6B);
+    (hash >> 8) as f32 / (1u32 << 24) as f32 - 0.5
+}
+
+const DITHER_VARIANCE: f32 = 1.0 / 12.0;
+
+/// Expected pair sum and 1/sigma of the residual at a pixel; `None` where the pixel is not looked at.
+struct Expected {
+    sum: f32,
+    per_sigma: f32,
+}
+
+fn from_references<T: Sample>(high: &[&[T]], low: &[&[T]], at: usize, gates: &Gates) -> Option<Expected> {
+    let mean = |planes: &[&[T]]| {
+        let mut sum = 0i64;
+        for plane in planes {
+            let dn = plane[at].dn();
+            if dn >= gates.saturation_dn {
+                return None;
+            }
+            sum += i64::from(dn);
+        }
+        Some(sum as f32 / planes.len() as f32)
+    };
+    let (high_dn, low_dn) = (mean(high)?, mean(low)?);
+    let (of_high, of_low) = (gates.variance(high_dn), gates.variance(low_dn));
+    let of_references = of_high / high.len() as f32 + of_low / low.len() as f32;
+    let variance = of_high + of_low + of_references + DITHER_VARIANCE;
+    let lit = (high_dn - low_dn).abs() >= gates.lit_sigma * of_references.sqrt();
+    lit.then(|| Expected { sum: high_dn + low_dn, per_sigma: variance.sqrt().recip() })
+}
+
+fn typed_residual<T: Sample>(p: Plane<'_>, q: Plane<'_>, context: &PairContext<'_>) -> Option<PairResidual> {
+    let (p, q) = (T::of(p)?, T::of(q)?);
+    let typed =
+        |planes: &[Plane<'_>]| planes.iter().all(|plane| T::of(*plane).is_some_and(|s| s.len() == p.len()));
+    let whole = context.width > 0 && p.len() == q.len() && p.len().is_multiple_of(context.width);
+    if !whole
+        || context.high.is_empty()
+        || context.low.is_empty()
+        || !typed(context.high)
+        || !typed(context.low)
+    {
+        return None;
+    }
+    let high: Vec<&[T]> = context.high.iter().filter_map(|&plane| T::of(plane)).collect();
+    let low: Vec<&[T]> = context.low.iter().filter_map(|&plane| T::of(plane)).collect();
+    let gates = Gates::for_check(context.camera, context.noise, context.lit_sigma);
+    let (width, height) = (context.width, p.len() / context.width);
+    let mut tally = Tally::new();
+    let above = |at: usize| p[at].dn() > q[at].dn();
+    for y in sampled_rows(height) {
+        for x in 0..width {
+            let at = y * width + x;
+            let (dn_p, dn_q) = (p[at].dn(), q[at].dn());
+            if dn_p >= gates.saturation_dn || dn_q >= gates.saturation_dn {
+                continue;
+            }
+            let Some(expected) = from_references(&high, &low, at, &gates) else { continue };
+            let here = above(at);
+            let flat = neighbours(x, y, width, height).all(|other| above(other) == here);
+            let residual = (dn_p + dn_q) as f32 - expected.sum + dither(at);
+            tally.add(residual * expected.per_sigma, flat);
+        }
+    }
+    Some(tally.finish(context.axis, context.bit))
+}
+
+/// Pixels up to [`NEAR_EDGE`] away along x and y.
+fn neighbours(x: usize, y: usize, width: usize, height: usize) -> impl Iterator<Item = usize> {
+    let at = y * width + x;
+    (1..=NEAR_EDGE).flat_map(move |step| {
+        [
+            (x >= step).then(|| at - step),
+            (x + step < width).then(|| at + step),
+            (y >= step).then(|| at - step * width),
+            (y + step < height).then(|| at + step * width),
+        ]
+        .into_iter()
+        .flatten()
+    })
+}
+
+/// Residuals of all pairs of a scan, in order of axis and bit.
+pub(crate) fn of_scan<T: Sample>(
+    frames: &Frames<'_, T>,
+    maps: &PixelMaps,
+    gates: &Gates,
+) -> Vec<PairResidual> {
+    let (width, height) = (frames.width, frames.height);
+    let pair_count = frames.pair_count();
+    let rows: Vec<usize> = sampled_rows(height).collect();
+    // Expected sum, 1/sigma (0 where a pixel is not looked at) and the bits that change nearby, once for all pairs.
+    let expected: Vec<(f32, f32, [u16; 2])> = rows
+        .par_iter()
+        .flat_map_iter(|&y| {
+            (0..width).map(move |x| {
+                let at = y * width + x;
+                let class = maps.class[at];
+                if !class.is_lit() || class == Class::Saturated {
+                    return (0.0, 0.0, [0; 2]);
+                }
+                let expected = match frames.levels {
+                    Levels::References => from_references(&frames.high, &frames.low, at, gates),
+                    _ => {
+                        let sum: i32 = frames.pairs().map(|(_, _, p, q)| p[at].dn() + q[at].dn()).sum();
+                        let kept = 1.0 - 1.0 / pair_count as f32;
+                        let variance = maps.sigma[at] * maps.sigma[at] * kept + DITHER_VARIANCE;
+                        (pair_count > 1).then(|| Expected {
+                            sum: sum as f32 / pair_count as f32,
+                            per_sigma: variance.sqrt().recip(),
+                        })
+                    }
+                };
+                let Some(expected) = expected else { return (0.0, 0.0, [0; 2]) };
+                let mut changed = [0u16; 2];
+                for (changed, words) in
+                    changed.iter_mut().zip(&maps.words).filter(|(_, words)| !words.is_empty())
+                {
+                    *changed = neighbours(x, y, width, height)
+                        .fold(0, |sum, other| sum | (words[other] ^ words[at]));
+                }
+                (expected.sum, expected.per_sigma, changed)
+            })
+        })
+        .collect();
+    let pairs: Vec<_> = frames.pairs().collect();
+    pairs
+        .par_iter()
+        .map(|&(axis, bit, p, q)| {
+            let mut tally = Tally::new();
+            let index = axis_position(frames, axis);
+            let mask = 1u16 << (frames.axes[index].code.bits - 1 - bit);
+            for (row, &y) in expected.chunks(width).zip(&rows) {
+                for (x, &(sum, per_sigma, changed)) in row.iter().enumerate() {
+                    let at = y * width + x;
+                    let (p, q) = (p[at].dn(), q[at].dn());
+                    if per_sigma == 0.0 || p >= gates.saturation_dn || q >= gates.saturation_dn {
+                        continue;
+                    }
+                    let residual = (p + q) as f32 - sum + dither(at);
+                    tally.add(residual * per_sigma, changed[index] & mask == 0);
+                }
+            }
+            tally.finish(axis, bit)
+        })
+        .collect()
+}

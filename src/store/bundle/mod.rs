@@ -1,0 +1,281 @@
+//! Writing a bundle: everything or nothing. Files are written and hashed in a folder `NAME.partial` beside the target,
+//! brought to the medium, followed by the manifest, and only then the folder gets its name.
+
+mod file;
+mod place;
+
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    fs, io,
+    path::{Component, Path, PathBuf},
+    sync::{Arc, Mutex, MutexGuard, PoisonError},
+    time::{Duration, Instant},
+};
+
+use rayon::prelude::*;
+
+use super::{
+    disk::{Disk, DiskFile, RealDisk},
+    error::StorageError,
+    manifest::{self, FileEntry, FrameFiles, Manifest},
+    maps::{self, Maps},
+    npy::FrameStream,
+    npz::{self, Array},
+    source::Policy,
+};
+use crate::{decode::Plane, truth::Truth};
+
+pub use file::BundleFile;
+pub use place::{remove_stale_partials, stale_partials};
+
+use place::Place;
+
+/// Name of the frames in our own bundles.
+pub const FRAMES_FILE_NAME: &str = "frames.npy";
+
+/// Name of the calibration in our own bundles.
+pub const CALIBRATION_FILE_NAME: &str = "calibration.toml";
+
+/// Time that a bundle took besides writing.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct WriteTimings {
+    /// Spent on hashing while files were written, summed over threads.
+    pub hashing: Duration,
+    /// From the call of `finish` until everything was on the medium under its name.
+    pub finishing: Duration,
+}
+
+/// A bundle that is being written. Dropping it unfinished leaves nothing behind.
+pub struct BundleWriter {
+    disk: Arc<dyn Disk>,
+    place: Place,
+    progress: Mutex<Progress>,
+    finished: bool,
+}
+
+impl std::fmt::Debug for BundleWriter {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("BundleWriter").field("place", &self.place).finish_non_exhaustive()
+    }
+}
+
+/// What has been written so far.
+#[derive(Default)]
+struct Progress {
+    /// Names given out, so that no file is written twice.
+    names: BTreeSet<String>,
+    files: BTreeMap<String, FileEntry>,
+    unsynced: Vec<(PathBuf, Box<dyn DiskFile>)>,
+    folders: BTreeSet<PathBuf>,
+    hashing: Duration,
+}
+
+impl BundleWriter {
+    /// Begins a bundle that will become the folder `out`, which must be absent or empty and must not be, or lie in,
+    /// `source`, the bundle that is read meanwhile. `expected_bytes` must be free on its disk. Missing parents are made.
+    pub fn create(out: &Path, source: Option<&Path>, expected_bytes: u64) -> Result<Self, StorageError> {
+        Self::create_on(Arc::new(RealDisk), out, source, expected_bytes)
+    }
+
+    fn create_on(
+        disk: Arc<dyn Disk>,
+        out: &Path,
+        source: Option<&Path>,
+        expected_bytes: u64,
+    ) -> Result<Self, StorageError> {
+        let place = Place::claim(&*disk, out, source, expected_bytes)?;
+        Ok(Self { disk, place, progress: Mutex::default(), finished: false })
+    }
+
+    /// The folder that the bundle will become, as an absolute path.
+    pub fn target(&self) -> &Path {
+        self.place.target()
+    }
+
+    fn progress(&self) -> MutexGuard<'_, Progress> {
+        self.progress.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Begins the file `name`, which may lie in a sub-folder: `maps/column.png`. Files may be written in parallel. What is
+    /// not committed is removed again.
+    pub fn file(&self, name: &str) -> Result<BundleFile<'_>, StorageError> {
+        let plain = |part| matches!(part, Component::Normal(_));
+        if name.is_empty() || name == manifest::FILE_NAME || !Path::new(name).components().all(plain) {
+            return Err(StorageError::refused(name, "is no name of a file in a bundle"));
+        }
+        if !self.progress().names.insert(name.to_owned()) {
+            return Err(StorageError::refused(name, "was written already"));
+        }
+        self.open(name)
+    }
+
+    fn open(&self, name: &str) -> Result<BundleFile<'_>, StorageError> {
+        let path = self.place.partial().join(name);
+        let folder = Path::new(name).parent().unwrap_or(Path::new(""));
+        let mut so_far = self.place.partial().to_owned();
+        for part in folder.components() {
+            so_far.push(part);
+            let mut progress = self.progress();
+            if !progress.folders.contains(&so_far) {
+                self.disk
+                    .create_folder(&so_far)
+                    .map_err(|error| StorageError::file("create folder", &so_far, error))?;
+                progress.folders.insert(so_far.clone());
+            }
+        }
+        let out = self.disk.create(&path).map_err(|error| StorageError::file("create", &path, error))?;
+        Ok(BundleFile::new(self, name, path, out))
+    }
+
+    /// Writes the file `name` with `write`, to which it is a stream.
+    pub fn write_with(
+        &self,
+        name: &str,
+        write: impl FnOnce(&mut BundleFile<'_>) -> io::Result<()>,
+    ) -> Result<(), StorageError> {
+        let mut file = self.file(name)?;
+        write(&mut file).map_err(|error| StorageError::file("write", file.path(), error))?;
+        file.commit()
+    }
+
+    /// Writes `bytes` as the file `name`.
+    pub fn bytes(&self, name: &str, bytes: &[u8]) -> Result<(), StorageError> {
+        self.write_with(name, |out| io::Write::write_all(out, bytes))
+    }
+
+    /// Begins `frames.npy`, to which frames are then added one by one.
+    pub fn frames(
+        &self,
+        frames: usize,
+        (width, height): (usize, usize),
+        bit_depth: u8,
+    ) -> Result<FramesWriter<'_>, StorageError> {
+        let file = self.file(FRAMES_FILE_NAME)?;
+        let path = file.path().to_owned();
+        let stream = FrameStream::new(file, frames, height, width, bit_depth)
+            .map_err(|error| StorageError::file("write", &path, error))?;
+        Ok(FramesWriter { stream, path })
+    }
+
+    /// Writes `arrays` as the archive `name`.
+    pub fn npz(&self, name: &str, arrays: &[(&str, Array<'_>)]) -> Result<(), StorageError> {
+        self.write_with(name, |out| npz::write(out, arrays))
+    }
+
+    /// Writes `maps.npz`.
+    pub fn maps(&self, maps: &Maps) -> Result<(), StorageError> {
+        self.write_with(maps::FILE_NAME, |out| maps.write(out))
+    }
+
+    /// Writes `truth.npz`. The names of its objects belong into the manifest.
+    pub fn truth(&self, truth: &Truth) -> Result<(), StorageError> {
+        self.write_with(maps::TRUTH_FILE_NAME, |out| maps::write_truth(out, truth))
+    }
+
+    /// Writes a picture as PNG.
+    pub fn png(&self, name: &str, picture: &image::RgbImage) -> Result<(), StorageError> {
+        self.write_with(name, |out| {
+            let encoder = image::codecs::png::PngEncoder::new_with_quality(
+                out,
+                image::codecs::png::CompressionType::Fast,
+                image::codecs::png::FilterType::Adaptive,
+            );
+            picture.write_with_encoder(encoder).map_err(|error| match error {
+                image::ImageError::IoError(error) => error,
+                other => io::Error::other(other),
+            })
+        })
+    }
+
+    /// Brings everything to the medium, writes the manifest with the hashes of all files, and gives the folder its name.
+    /// Returns the manifest as written.
+    pub fn finish(mut self, mut manifest: Manifest) -> Result<(Manifest, WriteTimings), StorageError> {
+        let start = Instant::now();
+        let progress = self.progress.get_mut().unwrap_or_else(PoisonError::into_inner);
+        let Progress { files, mut unsynced, folders, hashing, .. } = std::mem::take(progress);
+        manifest.files = files;
+        check(&manifest)?;
+        unsynced.par_iter_mut().try_for_each(|(path, file)| {
+            file.sync().map_err(|error| StorageError::file("sync", path, error))
+        })?;
+        drop(unsynced);
+        let sync = |folder: &Path| {
+            self.disk.sync_folder(folder).map_err(|error| StorageError::file("sync folder", folder, error))
+        };
+        for folder in &folders {
+            sync(folder)?;
+        }
+        let json = manifest.to_json().map_err(|error| {
+            StorageError::refused(manifest::FILE_NAME, format!("cannot be written: {error}"))
+        })?;
+        let path = self.place.partial().join(manifest::FILE_NAME);
+        let fail = |error| StorageError::file("write", &path, error);
+        let mut file = self.disk.create(&path).map_err(fail)?;
+        file.write_all(&json).and_then(|()| file.sync()).map_err(fail)?;
+        drop(file);
+        self.place.publish(&*self.disk)?;
+        self.finished = true;
+        Ok((manifest, WriteTimings { hashing, finishing: start.elapsed() }))
+    }
+}
+
+impl Drop for BundleWriter {
+    fn drop(&mut self) {
+        if !self.finished {
+            self.place.abandon();
+        }
+    }
+}
+
+/// Whether a bundle with `manifest` can be read again.
+fn check(manifest: &Manifest) -> Result<(), StorageError> {
+    let refused = |detail: String| Err(StorageError::refused(manifest::FILE_NAME, detail));
+    if let Err(faults) = manifest.check(Policy::Local, None) {
+        return refused(faults.to_string());
+    }
+    let mut named: Vec<&String> = manifest.calibration.iter().collect();
+    match &manifest.frames {
+        FrameFiles::Images(paths) if manifest.source.is_none() => named.extend(paths),
+        FrameFiles::Npy(path) if manifest.source.is_none() => named.push(path),
+        _ => {}
+    }
+    if manifest.truth_objects.is_some() != manifest.files.contains_key(maps::TRUTH_FILE_NAME) {
+        return refused(format!("{} and the names of its objects belong together", maps::TRUTH_FILE_NAME));
+    }
+    match named.into_iter().find(|name| !manifest.files.contains_key(*name)) {
+        Some(name) => refused(format!("names {name}, which is not in the bundle")),
+        None => Ok(()),
+    }
+}
+
+/// `frames.npy` while it grows.
+#[derive(Debug)]
+pub struct FramesWriter<'a> {
+    stream: FrameStream<BundleFile<'a>>,
+    path: PathBuf,
+}
+
+impl FramesWriter<'_> {
+    /// Appends a frame.
+    pub fn push(&mut self, plane: Plane<'_>) -> Result<(), StorageError> {
+        self.stream.push(plane).map_err(|error| StorageError::file("write frame to", &self.path, error))
+    }
+
+    /// Ends the file; all frames must have been added.
+    pub fn finish(self) -> Result<(), StorageError> {
+        let file = self.stream.finish().map_err(|error| StorageError::file("write", &self.path, error))?;
+        file.commit()
+    }
+}
+
+/// Removes a folder and what is in it, as far as that goes.
+fn remove_folder(path: &Path) {
+    if let Err(error) = fs::remove_dir_all(path)
+        && error.kind() != io::ErrorKind::NotFound
+    {
+        tracing::warn!(path = %path.display(), %error, "unfinished bundle could not be removed");
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,20 @@
+//! Bundles: one scan in one folder. Reading is strict and reports every fault; writing is all or nothing.
+
+pub mod bundle;
+mod disk;
+pub mod error;
+pub mod frames;
+mod images;
+pub mod manifest;
+pub mod maps;
+pub mod npy;
+pub mod npz;
+mod pnm;
+pub mod source;
+pub mod time;
+
+pub use bundle::{BundleWriter, WriteTimings};
+pub use error::{Fault, Faults, InputError, StorageError};
+pub use frames::{FrameSet, Limits};
+pub use manifest::Manifest;
+pub use source::{Bundle, Policy};
