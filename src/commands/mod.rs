@@ -4,6 +4,7 @@ mod decode;
 mod devices;
 mod failure;
 mod patterns;
+mod pictures;
 mod progress;
 mod results;
 mod scan;

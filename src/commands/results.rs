@@ -2,7 +2,7 @@
 
 use std::{path::Path, time::Instant};
 
-use super::Failure;
+use super::{Failure, pictures};
 use crate::{
     cloud::{CloudFrame, write_ply},
     decode::{DecodeSettings, SharedPlane},
@@ -33,13 +33,13 @@ pub fn write(writer: BundleWriter, mut manifest: Manifest, results: &Results) ->
     let start = Instant::now();
     let failed = |error: StorageError| Failure::storage("write the result", error);
     let Results { job, outcome, context, .. } = results;
-    if let Some(frames) = results.frames {
-        write_frames(&writer, &job.decode, frames).map_err(failed)?;
-    }
     let depth_mm = outcome.depth_mm();
     let maps = Maps::new(&outcome.decoded, outcome.class(), depth_mm.as_ref()).map_err(failed)?;
-    writer.maps(&maps).map_err(failed)?;
-    write_cloud(&writer, results).map_err(failed)?;
+    let frames = || results.frames.map_or(Ok(()), |frames| write_frames(&writer, &job.decode, frames));
+    let data = || writer.maps(&maps).and_then(|()| write_cloud(&writer, results));
+    let (frames, (data, pictures)) =
+        rayon::join(frames, || rayon::join(data, || pictures::write(&writer, results, &maps)));
+    frames.and(data).and(pictures).map_err(failed)?;
     if let Some(truth) = context.truth {
         writer.truth(truth).map_err(failed)?;
         manifest.truth_objects = Some(truth.objects.clone());
@@ -119,9 +119,9 @@ pub fn print(report: &Report, out: &Path, json: bool) {
         println!("{}", serde_json::json!({ "out": out, "verdict": report.verdict, "report": report }));
         return;
     }
-    let mut files = vec!["report.json", "maps.npz", "maps/"];
+    let mut files = vec!["overview.png", "report.json", "maps.npz", "maps/"];
     if report.points.is_some() {
-        files.insert(0, "cloud.ply");
+        files.splice(0..0, ["cloud.ply", "cloud.png"]);
     }
     print!("{}", report::summary(report, Some(Outputs { directory: out, files: &files })));
 }
