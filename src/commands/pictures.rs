@@ -33,7 +33,7 @@ pub fn write(writer: &BundleWriter, results: &Results, maps: &Maps) -> Result<()
     }
     if let Some(reconstruction) = &results.outcome.reconstruction {
         pictures.push(("maps/depth.png", Box::new(|| depth_picture(&maps.depth_mm, None))));
-        let view = || cloud_view(&reconstruction.cloud, ViewSettings::default());
+        let view = || cloud_view(&reconstruction.cloud, &ViewSettings::default());
         pictures.push(("cloud.png", Box::new(view)));
     }
     pictures.par_iter().try_for_each(|(name, draw)| writer.png(name, &draw()))
