@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use polscan_drivers::{
     camera::{Camera, CameraDriver, Listing},
-    clock::{Clock, MonotonicClock, VirtualClock},
+    clock::Clock,
     error::DeviceError,
     projector::{Projector, ProjectorDriver},
     sim,
@@ -24,8 +24,8 @@ pub enum RigError {
     #[error("no {0} is configured: set {0}.driver in the file given with --config, as config/sim.toml does")]
     NotConfigured(&'static str),
     /// The simulated rig cannot be set up.
-    #[error("the simulated rig cannot be set up")]
-    Sim(#[from] sim::SimError),
+    #[error(transparent)]
+    Sim(#[from] sim::RigError),
     /// A driver says no.
     #[error(transparent)]
     Device(#[from] DeviceError),
@@ -83,10 +83,7 @@ fn simulated(settings: &Settings) -> Result<Option<(sim::Rig, Arc<dyn Clock>)>, 
     let (Some((description, scene)), DeviceDriver::Sim) = (&settings.sim, settings.raw.camera.driver) else {
         return Ok(None);
     };
-    let clock: Arc<dyn Clock> = match description.pacing {
-        sim::Pacing::RealTime => Arc::new(MonotonicClock::start()),
-        sim::Pacing::Fast => Arc::new(VirtualClock::default()),
-    };
+    let clock = description.pacing.clock();
     Ok(Some((sim::Rig::new(description, scene, clock.clone())?, clock)))
 }
 

@@ -8,7 +8,7 @@ use polscan_patterns::Mode;
 use crate::{
     commands::{self, Failure},
     config::{Layers, Override},
-    report::Region,
+    report::NamedRegion,
 };
 
 /// 3D scanner for objects too shiny and too black for ordinary structured light.
@@ -58,7 +58,7 @@ struct Scan {
     exposure_us: Option<f64>,
     /// Rectangle of the camera image to measure as a plane, as NAME=x,y,width,height. May be repeated.
     #[arg(long, value_name = "NAME=X,Y,W,H")]
-    region: Vec<Region>,
+    region: Vec<NamedRegion>,
     /// Folder for the result; must be absent or empty.
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
@@ -79,7 +79,7 @@ struct Decode {
     mode: Option<Mode>,
     /// Rectangle of the camera image to measure as a plane, as NAME=x,y,width,height. May be repeated.
     #[arg(long, value_name = "NAME=X,Y,W,H")]
-    region: Vec<Region>,
+    region: Vec<NamedRegion>,
     /// Folder for the result; must be absent or empty.
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
@@ -108,7 +108,8 @@ fn layers(args: &ConfigArgs, flags: Vec<Override>) -> Layers {
 
 /// The environment, without variables that are not text: none of ours is.
 fn environment() -> impl Iterator<Item = (String, String)> {
-    std::env::vars_os().filter_map(|(name, value)| Some((name.into_string().ok()?, value.into_string().ok()?)))
+    std::env::vars_os()
+        .filter_map(|(name, value)| Some((name.into_string().ok()?, value.into_string().ok()?)))
 }
 
 /// Runs the program and returns its exit code.
@@ -144,9 +145,8 @@ fn dispatch(cli: &Cli) -> Result<u8, Failure> {
         Command::Scan(args) => {
             let mut flags = Vec::new();
             flags.extend(args.mode.map(|mode| Override::flag("--mode", "scan.mode", mode.name())));
-            flags.extend(
-                args.exposure_us.map(|us| Override::flag("--exposure-us", "camera.exposure_us", us)),
-            );
+            flags
+                .extend(args.exposure_us.map(|us| Override::flag("--exposure-us", "camera.exposure_us", us)));
             let settings = layers(&args.config, flags).load()?;
             commands::scan(&settings, &args.region, &args.out, cli.json)
         }

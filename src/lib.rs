@@ -1,11 +1,17 @@
 //! The scanner: from pattern to point cloud. Data flows one way:
 //! `patterns -> sequencer(projector, camera) -> frames -> decode -> geometry -> cloud -> report, store`.
 
+pub mod app;
+pub mod cli;
 pub mod cloud;
+pub mod commands;
+pub mod config;
 pub mod decode;
 pub mod geometry;
 pub mod grid;
+pub mod pipeline;
 pub mod report;
 pub mod sequencer;
 pub mod store;
 pub mod truth;
+pub mod verify;

@@ -73,8 +73,12 @@ pub fn run(job: &Job) -> Result<Outcome, PipelineError> {
     let triangulate_ms = reconstruction.is_some().then(|| milliseconds(start_triangulate));
     let after_last_frame = Some(milliseconds(start));
     let contrast = contrast(job, &decoded);
-    let timings =
-        Timings { decode: Some(decode_ms), triangulate: triangulate_ms, after_last_frame, ..Timings::default() };
+    let timings = Timings {
+        decode: Some(decode_ms),
+        triangulate: triangulate_ms,
+        after_last_frame,
+        ..Timings::default()
+    };
     Ok(Outcome { decoded, reconstruction, contrast, timings })
 }
 
@@ -92,8 +96,7 @@ fn contrast(job: &Job, decoded: &Decoded) -> Option<Contrast> {
     let dark = planes(|role| matches!(role, Role::ReferenceV | Role::Black));
     let lit = decoded.class.map(|class| class.is_lit());
     let camera = &job.decode.camera;
-    let found =
-        decode::contrast(&code, &dark, camera.bit_depth, camera.black_level_dn.unwrap_or(0.0), &lit)?;
+    let found = decode::contrast(&code, &dark, camera.bit_depth, camera.black_level_dn.unwrap_or(0.0), &lit)?;
     Some(Contrast::new(found.raw, found.dolp, found.raw_lit, found.dolp_lit))
 }
 

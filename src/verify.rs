@@ -41,8 +41,8 @@ pub struct PairSumJudge {
     camera: CameraResponse,
     thresholds: Thresholds,
     limits: PairThresholds,
-    high: Vec<Frame>,
-    low: Vec<Frame>,
+    high: Option<Frame>,
+    low: Option<Frame>,
     /// Pair against which the next one is compared where there are no two references, as in mode paper.
     first_pair: Option<[Frame; 2]>,
     noise: Option<NoiseModel>,
@@ -57,8 +57,8 @@ impl PairSumJudge {
             camera,
             thresholds,
             limits: PairThresholds::default(),
-            high: Vec::new(),
-            low: Vec::new(),
+            high: None,
+            low: None,
             first_pair: None,
         }
     }
@@ -66,7 +66,7 @@ impl PairSumJudge {
     /// Calibrated noise, or noise estimated from the first frames that sum to the same light.
     fn noise(&mut self, width: usize, frame: &Frame, inverse: &Frame) -> Option<NoiseModel> {
         if self.noise.is_none() {
-            let earlier = match (self.high.first(), self.low.first(), &self.first_pair) {
+            let earlier = match (&self.high, &self.low, &self.first_pair) {
                 (Some(high), Some(low), _) => [high, low],
                 (_, _, Some([first, second])) => [first, second],
                 _ => return None,
@@ -81,8 +81,8 @@ impl PairSumJudge {
 impl Judge for PairSumJudge {
     fn reference(&mut self, role: Role, frame: &Frame) {
         match role {
-            Role::ReferenceH | Role::White => self.high.push(frame.clone()),
-            Role::ReferenceV | Role::Black => self.low.push(frame.clone()),
+            Role::ReferenceH | Role::White => self.high = Some(frame.clone()),
+            Role::ReferenceV | Role::Black => self.low = Some(frame.clone()),
             Role::Code { .. } => {}
         }
     }
@@ -91,27 +91,21 @@ impl Judge for PairSumJudge {
         let width = frame.width as usize;
         let noise = self.noise(width, frame, inverse);
         // Without two references the first pair takes their place: any pair sums to the same light.
-        let (high, low) = match (&self.first_pair, self.high.is_empty() || self.low.is_empty()) {
-            (_, false) => (self.high.iter().collect(), self.low.iter().collect()),
-            (Some([first, second]), true) => (vec![first], vec![second]),
-            (None, true) => {
+        let (high, low) = match (&self.high, &self.low, &self.first_pair) {
+            (Some(high), Some(low), _) => (high, low),
+            (_, _, Some([first, second])) => (first, second),
+            _ => {
                 self.first_pair = Some([frame.clone(), inverse.clone()]);
                 return PairVerdict::Accept;
             }
         };
-        let planes = |frames: Vec<&Frame>| -> Vec<FramePlane> {
-            frames.into_iter().map(|frame| FramePlane(frame.store.clone())).collect()
-        };
-        let (high, low): (Vec<_>, Vec<_>) = (planes(high), planes(low));
-        let high: Vec<Plane> = high.iter().map(PlaneSource::plane).collect();
-        let low: Vec<Plane> = low.iter().map(PlaneSource::plane).collect();
         let residual = noise.and_then(|noise| {
             let context = PairContext {
                 axis,
                 bit,
                 width,
-                high: &high,
-                low: &low,
+                high: &[plane(high.pixels())],
+                low: &[plane(low.pixels())],
                 camera: self.camera,
                 noise,
                 lit_sigma: self.thresholds.lit_sigma,

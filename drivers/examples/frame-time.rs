@@ -26,7 +26,11 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let clock = description.pacing.clock();
     let start = Instant::now();
     let rig = Rig::new(&description, &scene, clock.clone())?;
-    println!("set-up {:.0} ms, {} threads", 1e3 * start.elapsed().as_secs_f64(), rayon::current_num_threads());
+    println!(
+        "set-up {:.0} ms, {} threads",
+        1e3 * start.elapsed().as_secs_f64(),
+        rayon::current_num_threads()
+    );
 
     let mut camera = rig.cameras().open(None)?;
     let mut projector = rig.projectors().open(None)?;
@@ -59,7 +63,12 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             times.push(1e3 * start.elapsed().as_secs_f64());
         }
         times.sort_by(f64::total_cmp);
-        println!("{name}: median {:.1} ms, worst {:.1} ms", times[times.len() / 2], times[times.len() - 1]);
+        println!(
+            "{name}: best {:.1} ms, median {:.1} ms, worst {:.1} ms",
+            times[0],
+            times[times.len() / 2],
+            times[times.len() - 1]
+        );
     }
     Ok(())
 }

@@ -103,3 +103,33 @@ pub trait ProjectorDriver {
     /// Opens the projector with `serial`, or the only one there is.
     fn open(&self, serial: Option<&str>) -> Result<Box<dyn Projector>, DeviceError>;
 }
+
+/// Refuses a slide that is not of the projector's native size.
+pub(crate) fn check_slide(info: &ProjectorInfo, number: usize, slide: &Slide) -> Result<(), DeviceError> {
+    let (width, height) = (info.width as usize, info.height as usize);
+    let (kind, has, needs) = match slide {
+        Slide::Uniform(_) => return Ok(()),
+        Slide::Columns(values) => ("columns", values.len(), width),
+        Slide::Rows(values) => ("rows", values.len(), height),
+        Slide::Full(values) => ("pixels", values.len(), width * height),
+    };
+    if has == needs {
+        return Ok(());
+    }
+    Err(DeviceError::Refused {
+        device: info.serial.clone(),
+        setting: "slide size",
+        requested: format!("{has} {kind} in slide {number}"),
+        offered: format!("{needs} ({width} x {height})"),
+    })
+}
+
+/// The refusal of a slide number that is not loaded.
+pub(crate) fn no_such_slide(info: &ProjectorInfo, index: u32, loaded: usize) -> DeviceError {
+    DeviceError::Refused {
+        device: info.serial.clone(),
+        setting: "slide number",
+        requested: index.to_string(),
+        offered: format!("{loaded} slides, numbered from 0"),
+    }
+}

@@ -126,9 +126,11 @@ mod tests {
         assert!(fit.rmse_mm < 1e-9 && fit.p95_mm < 1e-9 && fit.bow_mm < 1e-9, "{fit:?}");
         let norm = (1.0_f64 + 0.04 + 0.01).sqrt();
         let expected = [0.2 / norm, -0.1 / norm, -1.0 / norm];
-        for k in 0..3 {
-            assert!((fit.normal[k] - expected[k]).abs() < 1e-12, "{:?}", fit.normal);
-        }
+        assert!(
+            (Vector3::from(fit.normal) - Vector3::from(expected)).abs().max() < 1e-12,
+            "{:?}",
+            fit.normal
+        );
         assert!((fit.centroid_mm[2] - 1000.0).abs() < 1e-9);
     }
 

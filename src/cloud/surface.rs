@@ -75,11 +75,15 @@ pub(super) fn silhouettes(surface: &Surface<'_>) -> Grid<bool> {
     });
     let mut near = Grid::filled(width, height, false);
     near.data_mut().par_chunks_mut(width.max(1)).enumerate().for_each(|(y, row)| {
+        // Rows above and below are or-ed first, so that each pixel looks at three values instead of nine.
+        let mut column: Vec<bool> = border.row(y).to_vec();
+        for other in [y.checked_sub(1), Some(y + 1).filter(|&below| below < height)].into_iter().flatten() {
+            column.iter_mut().zip(border.row(other)).for_each(|(near, border)| *near |= border);
+        }
         for (x, near) in row.iter_mut().enumerate() {
-            let centre = y * width + x;
-            *near = surface.inverse_depth.data()[centre].is_finite()
-                && (border.data()[centre]
-                    || neighbours(x, y, width, height).any(|other| border.data()[other]));
+            let (left, right) = (x.saturating_sub(1), (x + 1).min(width - 1));
+            *near =
+                (column[left] || column[x] || column[right]) && surface.inverse_depth.at(x, y).is_finite();
         }
     });
     near
@@ -146,16 +150,78 @@ impl Moments {
     }
 }
 
-fn normal_at(surface: &Surface<'_>, x: usize, y: usize) -> Option<[f32; 3]> {
+/// Samples of one row of a window, one lane per column and one to spare: lanes are what the compiler vectorises.
+const LANES: usize = 8;
+
+/// Sums over the samples of the window around (x, y) that lie on its surface.
+fn gather(surface: &Surface<'_>, x: usize, y: usize, stride: usize) -> Moments {
     let (width, height) = surface.size();
-    let (w, sigma) = (surface.inverse_depth.data(), surface.sigma.data());
-    let centre = y * width + x;
-    let here = w[centre];
+    let (half, span) = (HALF as usize, 2 * HALF as usize + 1);
+    let (here, here_sigma) = (surface.inverse_depth.at(x, y), surface.sigma.at(x, y));
+    let reach = here * surface.pitch * STEEPEST * stride as f32;
+    let offset = |lane: usize| lane as f32 - HALF as f32;
+    let (mut n, mut w, mut jn, mut jw, mut jjn) =
+        ([0.0_f32; LANES], [0.0_f32; LANES], [0.0_f32; LANES], [0.0_f32; LANES], [0.0_f32; LANES]);
+    let inside = x >= half * stride && x + half * stride < width;
+    for step in 0..span {
+        let Some(j) = (y + step * stride).checked_sub(half * stride).filter(|&j| j < height) else {
+            continue;
+        };
+        let (row, row_sigma) = (surface.inverse_depth.row(j), surface.sigma.row(j));
+        // Lanes outside the image hold NaN, which no comparison accepts.
+        let (mut values, mut sigmas) = ([f32::NAN; LANES], [f32::NAN; LANES]);
+        if inside {
+            let from = x - half * stride;
+            for (value, found) in values[..span].iter_mut().zip(row[from..].iter().step_by(stride)) {
+                *value = *found;
+            }
+            for (sigma, found) in sigmas[..span].iter_mut().zip(row_sigma[from..].iter().step_by(stride)) {
+                *sigma = *found;
+            }
+        } else {
+            for lane in 0..span {
+                let i = (x + lane * stride).checked_sub(half * stride).filter(|&i| i < width);
+                if let Some(i) = i {
+                    (values[lane], sigmas[lane]) = (row[i], row_sigma[i]);
+                }
+            }
+        }
+        let dj = offset(step);
+        for lane in 0..LANES {
+            let distance = offset(lane).abs().max(dj.abs());
+            let rise = values[lane] - here;
+            let same = rise.abs() <= reach * distance + JUMP_SIGMAS * (sigmas[lane] + here_sigma);
+            let (m, rise) = if same { (1.0, rise) } else { (0.0, 0.0) };
+            n[lane] += m;
+            w[lane] += rise;
+            jn[lane] += m * dj;
+            jw[lane] += rise * dj;
+            jjn[lane] += m * dj * dj;
+        }
+    }
+    let mut sums = Moments::default();
+    for lane in 0..LANES {
+        let di = offset(lane);
+        sums.n += n[lane];
+        sums.i += n[lane] * di;
+        sums.ii += n[lane] * di * di;
+        sums.j += jn[lane];
+        sums.ij += jn[lane] * di;
+        sums.jj += jjn[lane];
+        sums.w += w[lane];
+        sums.iw += w[lane] * di;
+        sums.jw += jw[lane];
+    }
+    sums
+}
+
+fn normal_at(surface: &Surface<'_>, x: usize, y: usize) -> Option<[f32; 3]> {
+    let here = surface.inverse_depth.at(x, y);
     if !here.is_finite() {
         return None;
     }
     // Slope noise of a window of stride 1 is sigma_z / (z * pitch * gain) = sigma_w / (w * pitch * gain).
-    let noise = sigma[centre] / (here * surface.pitch * WINDOW_GAIN);
+    let noise = surface.sigma.at(x, y) / (here * surface.pitch * WINDOW_GAIN);
     let stride = if noise <= WANTED_SLOPE_SIGMA {
         1
     } else if noise <= 2.0 * WANTED_SLOPE_SIGMA {
@@ -163,37 +229,7 @@ fn normal_at(surface: &Surface<'_>, x: usize, y: usize) -> Option<[f32; 3]> {
     } else {
         3
     };
-    let reach = here * surface.pitch * STEEPEST * stride as f32;
-    let allowed = JUMP_SIGMAS * sigma[centre];
-    let mut sums = Moments::default();
-    for dj in -HALF..=HALF {
-        let j = y as i32 + dj * stride;
-        if j < 0 || j >= height as i32 {
-            continue;
-        }
-        let base = j as usize * width;
-        for di in -HALF..=HALF {
-            let i = x as i32 + di * stride;
-            if i < 0 || i >= width as i32 {
-                continue;
-            }
-            let at = base + i as usize;
-            let rise = w[at] - here;
-            let distance = di.abs().max(dj.abs()) as f32;
-            let same = rise.abs() <= reach * distance + JUMP_SIGMAS * sigma[at] + allowed;
-            let (m, rise) = if same { (1.0, rise) } else { (0.0, 0.0) };
-            let (di, dj) = (di as f32, dj as f32);
-            sums.n += m;
-            sums.i += m * di;
-            sums.j += m * dj;
-            sums.ii += m * di * di;
-            sums.ij += m * di * dj;
-            sums.jj += m * dj * dj;
-            sums.w += rise;
-            sums.iw += di * rise;
-            sums.jw += dj * rise;
-        }
-    }
+    let sums = gather(surface, x, y, stride as usize);
     let [rise, per_i, per_j] = sums.fit()?;
     let stride = f64::from(stride);
     orient(surface, x, y, f64::from(here) + rise, [per_i / stride, per_j / stride])

@@ -2,20 +2,20 @@
 
 use std::{path::Path, time::Instant};
 
-use polscan_patterns::{Mode, ProjectorSize, Sequence};
+use polscan_patterns::{Mode, ProjectorSize, Role, Sequence};
 
 use super::{
     Failure,
-    results::{self, Calibrated, Results},
+    results::{self, Results},
 };
 use crate::{
     cloud::ReconstructSettings,
-    geometry::{Calibration, CalibrationError, ReadHints},
+    geometry::{Calibration, ReadHints},
     pipeline::{self, Context, Job, PipelineError},
     report::{CaptureSummary, NamedRegion, Timings, Verdict},
     store::{
         Bundle, BundleWriter, FrameSet, Limits, Manifest, Policy,
-        manifest::{Processing, Volume},
+        manifest::{Capture, Processing, Volume},
     },
 };
 
@@ -44,7 +44,8 @@ pub struct DecodeArgs<'a> {
 pub fn decode(args: &DecodeArgs) -> Result<u8, Failure> {
     let start = Instant::now();
     let operation = || format!("decode {}", args.bundle.display());
-    let bundle = Bundle::open(args.bundle, Policy::Local, args.mode).map_err(|e| Failure::data(operation(), e))?;
+    let bundle =
+        Bundle::open(args.bundle, Policy::Local, args.mode).map_err(|e| Failure::data(operation(), e))?;
     // Refused before the work rather than after it.
     let writer = BundleWriter::create(args.out, Some(bundle.folder()), 0)
         .map_err(|error| Failure::storage("write the result", error))?;
@@ -52,7 +53,8 @@ pub fn decode(args: &DecodeArgs) -> Result<u8, Failure> {
     bundle.verify().map_err(|e| Failure::data(operation(), e))?;
     let load_ms = start.elapsed().as_secs_f64() * 1e3;
 
-    let (sequence, calibration) = resolve(args, &bundle, &frames).map_err(|e| Failure::data(operation(), e))?;
+    let (sequence, calibration) =
+        resolve(args, &bundle, &frames).map_err(|e| Failure::data(operation(), e))?;
     let manifest = bundle.manifest();
     let processing = manifest.processing.clone().unwrap_or_default();
     let regions = if args.regions.is_empty() { processing.regions.clone() } else { args.regions.to_vec() };
@@ -64,7 +66,7 @@ pub fn decode(args: &DecodeArgs) -> Result<u8, Failure> {
         roles: &sequence.roles,
         planes: &frames.planes,
         decode: manifest.decode_settings(&sequence, (frames.width, frames.height), frames.sample_bits),
-        calibration: calibration.as_ref().map(|calibrated| &calibrated.calibration),
+        calibration: calibration.as_ref(),
         reconstruct: ReconstructSettings {
             near_mm: volume.near_mm,
             far_mm: volume.far_mm,
@@ -74,7 +76,7 @@ pub fn decode(args: &DecodeArgs) -> Result<u8, Failure> {
     let outcome = pipeline::run(&job).map_err(|error: PipelineError| Failure::data(operation(), error))?;
 
     let truth = bundle.truth().map_err(|e| Failure::data(operation(), e))?;
-    let capture = manifest.capture.as_ref().map(|capture| CaptureSummary::new(&manifest.sequence, capture));
+    let capture = manifest.capture.as_ref().map(|capture| summary(&manifest.sequence, capture));
     let notes: Vec<String> = bundle.notes().iter().chain(&frames.notes).cloned().collect();
     let context = Context {
         truth: truth.as_ref(),
@@ -98,11 +100,30 @@ pub fn decode(args: &DecodeArgs) -> Result<u8, Failure> {
     result.settings = manifest.settings.clone();
     result.capture = manifest.capture.clone();
     result.source = Some(bundle.origin(&frames).map_err(|e| Failure::data(operation(), e))?);
-    result.processing =
-        Some(Processing { volume: processing.volume, regions, row_gate_px: processing.row_gate_px, ..processing });
+    result.processing = Some(Processing { regions: regions.clone(), ..processing });
     let report = results::write(writer, result, &results)?;
     results::print(&report, args.out, args.json);
     Ok(if report.verdict == Verdict::Failed { super::failure::FAILED } else { 0 })
+}
+
+/// What a recorded capture says of itself.
+fn summary(sequence: &[Role], capture: &Capture) -> CaptureSummary {
+    let evidence: Vec<_> = sequence
+        .iter()
+        .zip(&capture.frames)
+        .map(|(role, evidence)| (*role, evidence.receipt, evidence.stamp))
+        .collect();
+    CaptureSummary {
+        seconds: capture.seconds,
+        limit_seconds: capture.limit_seconds,
+        latency_ms: capture.latency_ms,
+        hold_frames: capture.hold_refreshes,
+        timing_measured: capture.timing_measured,
+        retaken: capture.retaken.clone(),
+        statistics: capture.statistics,
+        ..CaptureSummary::default()
+    }
+    .with_evidence(&evidence)
 }
 
 /// Sequence and calibration; each may know the projector's size when the other does not.
@@ -110,7 +131,7 @@ fn resolve(
     args: &DecodeArgs,
     bundle: &Bundle,
     frames: &FrameSet,
-) -> Result<(Sequence, Option<Calibrated>), Box<dyn std::error::Error + Send + Sync>> {
+) -> Result<(Sequence, Option<Calibration>), Box<dyn std::error::Error + Send + Sync>> {
     let manifest = bundle.manifest();
     let mut hints = ReadHints {
         camera_size: Some((frames.width as u32, frames.height as u32)),
@@ -119,30 +140,24 @@ fn resolve(
     };
     hints.projector_size = manifest.projector.map(|size| (size.width, size.height));
     let calibration = match args.calibration {
-        Some(path) => Some(read_calibration(path, &hints)?),
+        Some(path) => Some(Calibration::read_with(path, &hints)?),
         None => match bundle.calibration()? {
             Some((path, bytes)) => {
                 let name = path.display().to_string();
-                Some(Calibrated::new(Calibration::from_bytes(&bytes, &name, &hints)?, &name, bytes))
+                Some(Calibration::from_bytes(&bytes, &name, &hints)?)
             }
             None => None,
         },
     };
-    let size_of = |calibrated: &Calibrated| {
-        let (width, height) = calibrated.calibration.projector.as_ref()?.lens.size();
+    let size_of = |calibrated: &Calibration| {
+        let (width, height) = calibrated.projector.as_ref()?.lens.size();
         Some(ProjectorSize { width, height })
     };
     let sequence = manifest.resolve_sequence(args.mode, calibration.as_ref().and_then(size_of))?;
     if let Some(calibrated) = &calibration {
         let camera = (frames.width as u32, frames.height as u32);
         let size = sequence.size();
-        calibrated.calibration.check_sizes(camera, (size.width, size.height))?;
+        calibrated.check_sizes(camera, (size.width, size.height))?;
     }
     Ok((sequence, calibration))
-}
-
-/// Reads a calibration file of any known format.
-pub fn read_calibration(path: &Path, hints: &ReadHints) -> Result<Calibrated, CalibrationError> {
-    let calibration = Calibration::read_with(path, hints)?;
-    Ok(Calibrated { calibration, source: path.display().to_string() })
 }

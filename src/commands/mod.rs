@@ -4,7 +4,9 @@ mod decode;
 mod devices;
 mod failure;
 mod patterns;
+mod pictures;
 mod progress;
+mod results;
 mod scan;
 
 pub use decode::{DecodeArgs, decode};

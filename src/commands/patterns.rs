@@ -5,7 +5,10 @@ use std::{path::Path, str::FromStr};
 use polscan_patterns::{Mode, ProjectorSize, Sequence};
 
 use super::Failure;
-use crate::config::Settings;
+use crate::{
+    config::Settings,
+    store::{BundleWriter, Manifest, error::StorageError, manifest::FrameFiles},
+};
 
 /// A projector size on the command line.
 #[derive(Debug, Clone, Copy)]
@@ -22,4 +25,56 @@ impl FromStr for Size {
         };
         Ok(Self(ProjectorSize { width: side(width)?, height: side(height)? }))
     }
+}
+
+/// Writes one PNG per frame, and a manifest under which the folder is itself a bundle that decodes to the identity.
+pub fn patterns(
+    settings: &Settings,
+    mode: Mode,
+    size: Option<Size>,
+    out: &Path,
+    json: bool,
+) -> Result<u8, Failure> {
+    let size = match size {
+        Some(Size(size)) => size,
+        None => configured_size(settings)?,
+    };
+    let sequence = Sequence::new(mode, size).map_err(|error| Failure::data("make the patterns", error))?;
+    let failed = |error: StorageError| Failure::storage("write the patterns", error);
+    let writer = BundleWriter::create(out, None, 0).map_err(failed)?;
+    let mut names = Vec::new();
+    for (number, role) in sequence.roles.iter().enumerate() {
+        let name = format!("{number:02}_{}.png", role.to_string().replace(' ', "-"));
+        let bytes = sequence.raster(*role, settings.polarization).to_rgb(size);
+        let picture = image::RgbImage::from_raw(size.width, size.height, bytes)
+            .expect("a raster holds three bytes for each pixel of its size");
+        writer.png(&name, &picture).map_err(failed)?;
+        names.push(name);
+    }
+    let mut manifest = Manifest::new(&sequence, FrameFiles::Images(names.clone()));
+    manifest.stamp(std::time::SystemTime::now());
+    writer.finish(manifest).map_err(failed)?;
+    if json {
+        let object = serde_json::json!({ "out": out, "mode": mode, "projector": size, "frames": names });
+        println!("{object}");
+    } else {
+        println!(
+            "{} patterns of mode {mode} for {}x{} px, described by manifest.json, in {}",
+            names.len(),
+            size.width,
+            size.height,
+            out.display()
+        );
+    }
+    Ok(0)
+}
+
+/// Size of the configured projector.
+fn configured_size(settings: &Settings) -> Result<ProjectorSize, Failure> {
+    let rig = crate::app::Rig::open(settings).map_err(|_| Failure::NoDevice {
+        operation: "choose the size of the patterns",
+        message: "no projector is configured; give --size WIDTHxHEIGHT or a --config with one".into(),
+    })?;
+    let info = rig.projector.info();
+    Ok(ProjectorSize { width: info.width, height: info.height })
 }

@@ -2,23 +2,15 @@
 
 use std::{path::Path, time::Instant};
 
-use super::Failure;
+use super::{Failure, pictures};
 use crate::{
     cloud::{CloudFrame, write_ply},
-    decode::SharedPlane,
+    decode::{DecodeSettings, SharedPlane},
     geometry::Calibration,
     pipeline::{self, Context, Job, Outcome},
     report::{self, Outputs, Report, Timings},
     store::{BundleWriter, Manifest, bundle, error::StorageError, maps::Maps},
 };
-
-/// A calibration and where it came from.
-pub struct Calibrated {
-    /// As used.
-    pub calibration: Calibration,
-    /// File it was read from, for messages.
-    pub source: String,
-}
 
 /// Everything that a result is written from.
 pub struct Results<'a> {
@@ -31,7 +23,7 @@ pub struct Results<'a> {
     /// Times known before writing.
     pub timings: Timings,
     /// Calibration that was used.
-    pub calibration: Option<&'a Calibrated>,
+    pub calibration: Option<&'a Calibration>,
     /// Frames to store; `None` where the manifest names another bundle's.
     pub frames: Option<&'a [SharedPlane]>,
 }
@@ -41,36 +33,65 @@ pub fn write(writer: BundleWriter, mut manifest: Manifest, results: &Results) ->
     let start = Instant::now();
     let failed = |error: StorageError| Failure::storage("write the result", error);
     let Results { job, outcome, context, .. } = results;
-    if let Some(frames) = results.frames {
-        write_frames(&writer, job, frames).map_err(failed)?;
-    }
     let depth_mm = outcome.depth_mm();
     let maps = Maps::new(&outcome.decoded, outcome.class(), depth_mm.as_ref()).map_err(failed)?;
-    writer.maps(&maps).map_err(failed)?;
-    write_cloud(&writer, results).map_err(failed)?;
+    let frames = || results.frames.map_or(Ok(()), |frames| write_frames(&writer, &job.decode, frames));
+    let data = || writer.maps(&maps).and_then(|()| write_cloud(&writer, results));
+    let (frames, (data, pictures)) =
+        rayon::join(frames, || rayon::join(data, || pictures::write(&writer, results, &maps)));
+    frames.and(data).and(pictures).map_err(failed)?;
     if let Some(truth) = context.truth {
         writer.truth(truth).map_err(failed)?;
         manifest.truth_objects = Some(truth.objects.clone());
     }
     if let Some(calibrated) = results.calibration {
-        let toml = calibrated.calibration.to_toml();
+        let toml = calibrated.to_toml();
         writer.bytes(bundle::CALIBRATION_FILE_NAME, toml.as_bytes()).map_err(failed)?;
         manifest.calibration = Some(bundle::CALIBRATION_FILE_NAME.into());
     }
-    write_pictures(&writer, results, &maps).map_err(failed)?;
     manifest.record_decode(&job.decode);
     manifest.stamp(std::time::SystemTime::now());
-    let timings = Timings { write: Some(start.elapsed().as_secs_f64() * 1e3), ..results.timings };
+    let timings = Timings { write: Some(milliseconds(start)), ..results.timings };
     let report = pipeline::report(job, outcome, context, timings);
-    let json = serde_json::to_vec_pretty(&report).map_err(|e| Failure::storage("write report.json", e))?;
-    writer.bytes("report.json", &json).map_err(failed)?;
+    write_report(&writer, &report)?;
     writer.finish(manifest).map_err(failed)?;
     Ok(report)
 }
 
-fn write_frames(writer: &BundleWriter, job: &Job, frames: &[SharedPlane]) -> Result<(), StorageError> {
-    let size = (job.decode.width, job.decode.height);
-    let mut out = writer.frames(frames.len(), size, job.decode.camera.bit_depth)?;
+/// Writes the frames of a capture that did not end well, and a report that says why.
+pub fn write_unfinished(
+    writer: BundleWriter,
+    mut manifest: Manifest,
+    decode: &DecodeSettings,
+    frames: &[SharedPlane],
+    report: impl FnOnce(Timings) -> Report,
+) -> Result<Report, Failure> {
+    let start = Instant::now();
+    let failed = |error: StorageError| Failure::storage("write what was captured", error);
+    write_frames(&writer, decode, frames).map_err(failed)?;
+    manifest.record_decode(decode);
+    manifest.stamp(std::time::SystemTime::now());
+    let report = report(Timings { write: Some(milliseconds(start)), ..Timings::default() });
+    write_report(&writer, &report)?;
+    writer.finish(manifest).map_err(failed)?;
+    Ok(report)
+}
+
+fn milliseconds(since: Instant) -> f64 {
+    since.elapsed().as_secs_f64() * 1e3
+}
+
+fn write_report(writer: &BundleWriter, report: &Report) -> Result<(), Failure> {
+    let json = serde_json::to_vec_pretty(report).map_err(|e| Failure::storage("write report.json", e))?;
+    writer.bytes("report.json", &json).map_err(|e| Failure::storage("write the result", e))
+}
+
+fn write_frames(
+    writer: &BundleWriter,
+    decode: &DecodeSettings,
+    frames: &[SharedPlane],
+) -> Result<(), StorageError> {
+    let mut out = writer.frames(frames.len(), (decode.width, decode.height), decode.camera.bit_depth)?;
     for frame in frames {
         out.push(frame.plane())?;
     }
@@ -83,7 +104,9 @@ fn write_cloud(writer: &BundleWriter, results: &Results) -> Result<(), StorageEr
     let intensity = &results.outcome.decoded.intensity;
     writer.write_with("cloud.ply", |out| {
         match world {
-            Some(pose) => write_ply(out, &reconstruction.cloud.transformed(pose), intensity, CloudFrame::World),
+            Some(pose) => {
+                write_ply(out, &reconstruction.cloud.transformed(pose), intensity, CloudFrame::World)
+            }
             None => write_ply(out, &reconstruction.cloud, intensity, CloudFrame::Camera),
         }
         .map(|_| ())
@@ -96,9 +119,9 @@ pub fn print(report: &Report, out: &Path, json: bool) {
         println!("{}", serde_json::json!({ "out": out, "verdict": report.verdict, "report": report }));
         return;
     }
-    let mut files = vec!["report.json", "maps.npz", "maps/"];
+    let mut files = vec!["overview.png", "report.json", "maps.npz", "maps/"];
     if report.points.is_some() {
-        files.insert(0, "cloud.ply");
+        files.splice(0..0, ["cloud.ply", "cloud.png"]);
     }
     print!("{}", report::summary(report, Some(Outputs { directory: out, files: &files })));
 }

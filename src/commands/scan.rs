@@ -6,22 +6,19 @@ use polscan_patterns::{ProjectorSize, Sequence};
 
 use super::{
     Failure,
-    decode::read_calibration,
     failure::FAILED,
     progress::Bar,
-    results::{self, Calibrated, Results},
+    results::{self, Results},
 };
 use crate::{
     app::{Rig, RigError},
     cloud::ReconstructSettings,
     config::Settings,
     decode::{CameraResponse, DecodeSettings, NoiseModel, SharedPlane},
-    geometry::ReadHints,
+    geometry::{Calibration, ReadHints},
     pipeline::{self, Context, Job},
     report::{CaptureSummary, NamedRegion, Reason, Report, Verdict},
-    sequencer::{
-        CancelFlag, CaptureFailure, CaptureRecord, Plan, PlanError, PlanOptions, Progress, capture,
-    },
+    sequencer::{CancelFlag, CaptureFailure, CaptureRecord, Plan, PlanError, PlanOptions, Progress, capture},
     store::{
         BundleWriter, Manifest,
         bundle::FRAMES_FILE_NAME,
@@ -85,7 +82,7 @@ pub fn scan(settings: &Settings, regions: &[NamedRegion], out: &Path, json: bool
         camera: rig.camera.info().clone(),
         projector: info,
         polarization: settings.polarization,
-        calibration_id: calibration.as_ref().map(|calibrated| calibrated.calibration.id()),
+        calibration_id: calibration.as_ref().map(Calibration::id),
     });
     let volume = Volume { near_mm: settings.raw.volume.near_mm, far_mm: settings.raw.volume.far_mm };
     manifest.processing = Some(Processing {
@@ -109,7 +106,7 @@ struct Setup<'a> {
     settings: &'a Settings,
     rig: &'a Rig,
     decode: DecodeSettings,
-    calibration: Option<&'a Calibrated>,
+    calibration: Option<&'a Calibration>,
     volume: Volume,
     regions: &'a [NamedRegion],
 }
@@ -122,12 +119,13 @@ fn finish(
     writer: BundleWriter,
 ) -> Result<Report, Failure> {
     let roles: Vec<_> = record.frames.iter().map(|captured| captured.role).collect();
-    let planes: Vec<SharedPlane> = record.frames.iter().map(|captured| shared_plane(&captured.frame)).collect();
+    let planes: Vec<SharedPlane> =
+        record.frames.iter().map(|captured| shared_plane(&captured.frame)).collect();
     let job = Job {
         roles: &roles,
         planes: &planes,
         decode: setup.decode.clone(),
-        calibration: setup.calibration.map(|calibrated| &calibrated.calibration),
+        calibration: setup.calibration,
         reconstruct: ReconstructSettings {
             near_mm: setup.volume.near_mm,
             far_mm: setup.volume.far_mm,
@@ -237,22 +235,17 @@ fn calibration(
     settings: &Settings,
     camera: (u32, u32),
     projector: ProjectorSize,
-) -> Result<Option<Calibrated>, Failure> {
+) -> Result<Option<Calibration>, Failure> {
     let Some(path) = settings.calibration.as_ref().map(|calibration| &calibration.path) else {
         return Ok(None);
     };
     let projector = (projector.width, projector.height);
-    let hints = ReadHints {
-        camera_size: Some(camera),
-        projector_size: Some(projector),
-        ..ReadHints::default()
-    };
+    let hints =
+        ReadHints { camera_size: Some(camera), projector_size: Some(projector), ..ReadHints::default() };
     let operation = || format!("use the calibration {}", path.display());
-    let calibrated = read_calibration(path, &hints).map_err(|error| Failure::data(operation(), error))?;
-    calibrated
-        .calibration
-        .check_sizes(camera, projector)
-        .map_err(|error| Failure::data(operation(), error))?;
+    let calibrated =
+        Calibration::read_with(path, &hints).map_err(|error| Failure::data(operation(), error))?;
+    calibrated.check_sizes(camera, projector).map_err(|error| Failure::data(operation(), error))?;
     Ok(Some(calibrated))
 }
 

@@ -156,12 +156,15 @@ impl Layers {
             let default = get(&defaults(), &key).cloned();
             let origin = self.origin_of(&key);
             let unknown = default.is_none();
-            if faults.iter().any(|fault| missing_field(&message, &key).is_some_and(|path| path == fault.key)) {
+            if faults.iter().any(|fault| missing_field(&message, &key).is_some_and(|path| path == fault.key))
+            {
                 return None;
             }
             faults.push(Fault { key: key.clone(), message, origin });
             let mended = match default {
-                Some(default) if get(&table, &key) != Some(&default) => set(&mut table, &key, default).is_ok(),
+                Some(default) if get(&table, &key) != Some(&default) => {
+                    set(&mut table, &key, default).is_ok()
+                }
                 _ => unknown && remove(&mut table, &key),
             };
             if !mended {

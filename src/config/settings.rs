@@ -139,7 +139,8 @@ fn polarization(raw: &raw::Projector, faults: &mut Faults) -> Option<Polarizatio
     let horizontal = channels("projector.horizontal", &raw.horizontal);
     let vertical = channels("projector.vertical", &raw.vertical);
     if let Some(both) = raw.horizontal.chars().find(|letter| raw.vertical.contains(*letter)) {
-        let message = format!("channel `{both}` is in projector.horizontal too; a channel has one polarization");
+        let message =
+            format!("channel `{both}` is in projector.horizontal too; a channel has one polarization");
         faults.push(("projector.vertical".into(), message));
     }
     (faults.len() == before).then_some(Polarization { horizontal, vertical })
@@ -152,7 +153,8 @@ fn region(raw: &raw::RegionTable, faults: &mut Faults) -> Option<Region> {
             Some(Region { x, y, width, height })
         }
         _ => {
-            faults.push(("camera.region".into(), "needs x, y, width and height, the last two above 0".into()));
+            faults
+                .push(("camera.region".into(), "needs x, y, width and height, the last two above 0".into()));
             None
         }
     }
@@ -164,10 +166,19 @@ fn calibration(text: &str, folder: &Path, faults: &mut Faults) -> Option<RigCali
     }
     let path = folder.join(text);
     if !path.is_file() {
-        let message = format!("no file at {}; the path is relative to the configuration file", path.display());
+        let message =
+            format!("no file at {}; the path is relative to the configuration file", path.display());
         faults.push(("rig.calibration".into(), message));
     }
     Some(RigCalibration { path })
+}
+
+/// A fault of the rig's description, which begins with its key path.
+fn split_key(fault: String) -> (String, String) {
+    match fault.split_once(": ") {
+        Some((key, message)) => (key.into(), message.into()),
+        None => ("sim".into(), fault),
+    }
 }
 
 fn sim(raw: &Raw, folder: &Path, faults: &mut Faults) -> Option<(RigDescription, Scene)> {
@@ -178,7 +189,7 @@ fn sim(raw: &Raw, folder: &Path, faults: &mut Faults) -> Option<(RigDescription,
         }
         return None;
     };
-    faults.extend(description.validate().into_iter().map(|(key, message)| (format!("sim.{key}"), message)));
+    faults.extend(description.validate().into_iter().map(split_key));
     let path = folder.join(&description.scene);
     let text = match std::fs::read_to_string(&path) {
         Ok(text) => text,
@@ -189,8 +200,8 @@ fn sim(raw: &Raw, folder: &Path, faults: &mut Faults) -> Option<(RigDescription,
     };
     match toml::from_str::<Scene>(&text) {
         Ok(scene) => {
-            let found = scene.validate();
-            faults.extend(found.into_iter().map(|(key, text)| (format!("sim.scene: {key}"), text)));
+            let found = scene.validate().into_iter();
+            faults.extend(found.map(|fault| ("sim.scene".into(), format!("{}: {fault}", path.display()))));
             Some((description.clone(), scene))
         }
         Err(error) => {

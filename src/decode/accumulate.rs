@@ -169,30 +169,22 @@ fn decode<T: Sample>(
     let pairs = pair_sum::of_scan(&frames, &maps, &gates);
     let drift = drift(&frames, &maps);
     let (boundaries, shapes) = gates::apply(&frames, &mut maps, &settings.thresholds);
-    let mut interpolated = vec![false; maps.class.len()];
-    let mut axis_maps = Vec::new();
-    for (index, shape) in shapes.iter().enumerate() {
-        axis_maps.push(subpixel::refine(
-            &frames,
-            &maps,
-            &gates,
-            &settings.thresholds,
-            index,
-            *shape,
-            &mut interpolated,
-        ));
-    }
+    let mut refined = shapes
+        .iter()
+        .enumerate()
+        .map(|(index, shape)| subpixel::refine(&frames, &maps, &gates, &settings.thresholds, index, *shape));
     let (width, height) = (settings.width, settings.height);
-    let mut axis_maps = axis_maps.into_iter();
-    let Some(column) = axis_maps.next() else {
+    let Some((column, interpolated)) = refined.next() else {
         return Err(DecodeError::Missing {
             mode: settings.mode,
             missing: "the frames of the columns".into(),
         });
     };
+    let row = refined.next().map(|(row, _)| row);
+    drop(refined);
     Ok(Decoded {
         column,
-        row: axis_maps.next(),
+        row,
         class: Grid::from_vec(width, height, maps.class),
         half_saturated: Grid::from_vec(width, height, maps.half_saturated),
         interpolated: Grid::from_vec(width, height, interpolated),

@@ -21,6 +21,8 @@ const MIN_SIGMA: f64 = 1e-6;
 const MIN_INVERSE_DEPTH: f64 = 1e-9;
 /// Newton steps; each roughly squares the error.
 const MAX_STEPS: usize = 12;
+/// A relative step below this leaves an error of about its square times the curvature, under 1e-10.
+const STEP_TOLERANCE: f64 = 1e-5;
 
 /// What the decoder measured at one pixel. NaN for an axis that was not measured.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -215,7 +217,7 @@ impl Triangulator {
             let step = (value - seen.pixel[axis]) / seen.slope[axis];
             w += step;
             seen = self.see(q, w)?;
-            if step.abs() <= 1e-7 * w.abs() {
+            if step.abs() <= STEP_TOLERANCE * w.abs() {
                 return Some((w, seen));
             }
         }
@@ -241,7 +243,7 @@ impl Triangulator {
             let step = pull / information;
             w += step;
             seen = self.see(q, w)?;
-            if step.abs() <= 1e-7 * w.abs() {
+            if step.abs() <= STEP_TOLERANCE * w.abs() {
                 return Some((w, seen, information));
             }
         }

@@ -1,6 +1,6 @@
 //! What the report needs to know of a capture, whether it has just ended or is read from a recording.
 
-use polscan_drivers::camera::StreamStatistics;
+use polscan_drivers::{camera::StreamStatistics, frame::FrameStamp, projector::PresentReceipt};
 use polscan_patterns::Role;
 use serde::{Deserialize, Serialize};
 
@@ -31,23 +31,8 @@ pub struct CaptureSummary {
 
 impl From<&CaptureRecord> for CaptureSummary {
     fn from(record: &CaptureRecord) -> Self {
-        let frames = &record.frames;
-        let early = frames
-            .iter()
-            .filter(|taken| taken.frame.stamp.exposure_start < taken.receipt.flipped)
-            .map(|taken| taken.role)
-            .collect();
-        let mut shared_slide = Vec::new();
-        for (index, one) in frames.iter().enumerate() {
-            for other in &frames[..index] {
-                if one.receipt.slide.is_some()
-                    && one.receipt.slide == other.receipt.slide
-                    && one.role != other.role
-                {
-                    shared_slide.push([other.role, one.role]);
-                }
-            }
-        }
+        let frames: Vec<_> =
+            record.frames.iter().map(|taken| (taken.role, taken.receipt, taken.frame.stamp)).collect();
         Self {
             seconds: record.seconds,
             limit_seconds: record.limit_seconds,
@@ -56,13 +41,30 @@ impl From<&CaptureRecord> for CaptureSummary {
             timing_measured: record.timing_measured,
             retaken: record.retaken.clone(),
             statistics: record.statistics,
-            early,
-            shared_slide,
+            early: Vec::new(),
+            shared_slide: Vec::new(),
         }
+        .with_evidence(&frames)
     }
 }
 
 impl CaptureSummary {
+    /// Looks through receipts and stamps for frames that cannot show what their role says.
+    pub fn with_evidence(mut self, frames: &[(Role, PresentReceipt, FrameStamp)]) -> Self {
+        let exposed_early = |(role, receipt, stamp): &(Role, PresentReceipt, FrameStamp)| {
+            (stamp.exposure_start < receipt.flipped).then_some(*role)
+        };
+        self.early = frames.iter().filter_map(exposed_early).collect();
+        for (index, (role, receipt, _)) in frames.iter().enumerate() {
+            for (earlier_role, earlier, _) in &frames[..index] {
+                if receipt.slide.is_some() && receipt.slide == earlier.slide && role != earlier_role {
+                    self.shared_slide.push([*earlier_role, *role]);
+                }
+            }
+        }
+        self
+    }
+
     /// Exposures that were asked for and gave no whole frame.
     pub fn lost_frames(&self) -> u64 {
         let StreamStatistics { triggers, frames, failed } = self.statistics;

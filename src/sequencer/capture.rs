@@ -17,11 +17,11 @@ use polscan_drivers::{
     projector::{PresentReceipt, Projector, Slide},
 };
 use polscan_patterns::{Raster, Role};
-use thiserror::Error;
 
 use super::{
+    failure::{CaptureError, CaptureFailure, PartialCapture},
     judge::{Judge, PairVerdict, Suspicion},
-    machine::{Action, Device, Diagnosis, Event, GroupRetake, Machine, Outcome, Subject},
+    machine::{Action, Device, Event, GroupRetake, Machine, Outcome, Subject},
     plan::{Group, Plan},
     record::{CaptureNotes, CaptureRecord, CapturedFrame, Finding, ReferenceRetake, Retake},
 };
@@ -76,99 +76,6 @@ pub enum Progress<'a> {
         /// Why, and for which time.
         retake: &'a GroupRetake,
     },
-}
-
-/// Why a capture is not complete.
-#[derive(Debug, Clone, PartialEq, Error)]
-pub enum CaptureError {
-    /// The projector does not take the pictures.
-    #[error("loading {slides} pictures into the projector failed")]
-    Load {
-        /// Number of pictures.
-        slides: usize,
-        /// Cause.
-        #[source]
-        source: DeviceError,
-    },
-    /// The camera does not start.
-    #[error("arming the camera for {frames} frames failed")]
-    Arm {
-        /// Number of frames.
-        frames: usize,
-        /// Cause.
-        #[source]
-        source: DeviceError,
-    },
-    /// The user asked for it.
-    #[error("the capture was cancelled")]
-    Cancelled,
-    /// A device failed for good.
-    #[error("capture failed ({reason}) at {}: {evidence}", at(*role))]
-    Device {
-        /// Which device.
-        device: Device,
-        /// Slug.
-        reason: String,
-        /// What was being captured.
-        role: Option<Role>,
-        /// Evidence in words.
-        evidence: String,
-        /// Cause.
-        #[source]
-        source: DeviceError,
-    },
-    /// Frames are not what was projected, however often they are taken.
-    #[error("capture failed ({reason}) at {}: {evidence}", at(*role))]
-    Diagnosed {
-        /// Slug.
-        reason: String,
-        /// What was being captured.
-        role: Option<Role>,
-        /// Evidence in words.
-        evidence: String,
-    },
-}
-
-fn at(role: Option<Role>) -> String {
-    role.map_or("its end".to_string(), |role| role.to_string())
-}
-
-impl CaptureError {
-    /// Slug of the diagnosis.
-    pub fn reason(&self) -> &str {
-        match self {
-            Self::Load { .. } => "projector-failed",
-            Self::Arm { .. } => "camera-failed",
-            Self::Cancelled => "cancelled",
-            Self::Device { reason, .. } | Self::Diagnosed { reason, .. } => reason,
-        }
-    }
-}
-
-/// What an unfinished capture leaves.
-#[derive(Debug, Clone, Default)]
-pub struct PartialCapture {
-    /// The last take of each frame in the order of the sequence, judged or not, without those that never came.
-    pub frames: Vec<CapturedFrame>,
-    /// Pairs that were captured again.
-    pub retaken: Vec<Retake>,
-    /// From the first flip to the last frame, in seconds of the rig's clock.
-    pub seconds: f64,
-    /// Counters of the camera's stream, where it could be stopped.
-    pub statistics: Option<StreamStatistics>,
-    /// What was noticed.
-    pub notes: CaptureNotes,
-}
-
-/// An unfinished capture.
-#[derive(Debug, Clone, Error)]
-#[error("the capture is not complete: {} frames were kept", partial.frames.len())]
-pub struct CaptureFailure {
-    /// Why.
-    #[source]
-    pub error: Box<CaptureError>,
-    /// What there is.
-    pub partial: Box<PartialCapture>,
 }
 
 /// The picture as a projector takes it.
@@ -230,16 +137,17 @@ struct Rig<'a> {
 }
 
 impl Rig<'_> {
-    fn prepare(&mut self, plan: &Plan) -> Result<(), CaptureError> {
+    fn prepare(&mut self, plan: &Plan) -> Result<(), Box<CaptureError>> {
         let slides: Vec<Slide> = plan
             .sequence
             .roles
             .iter()
             .map(|&role| slide(plan.sequence.raster(role, plan.polarization)))
             .collect();
-        let load = |source| CaptureError::Load { slides: slides.len(), source };
+        let load = |source| Box::new(CaptureError::Load { slides: slides.len(), source });
         self.projector.load(&slides).map_err(load)?;
-        self.camera.arm(slides.len()).map_err(|source| CaptureError::Arm { frames: slides.len(), source })
+        let arm = |source| Box::new(CaptureError::Arm { frames: slides.len(), source });
+        self.camera.arm(slides.len()).map_err(arm)
     }
 
     fn black(&mut self) -> Result<PresentReceipt, DeviceError> {
@@ -472,7 +380,7 @@ impl Shell<'_> {
     fn conclude(
         mut self,
         machine: &Machine,
-        prepared: Result<(), CaptureError>,
+        prepared: Result<(), Box<CaptureError>>,
     ) -> Result<CaptureRecord, CaptureFailure> {
         let mut notes = CaptureNotes {
             findings: machine.findings().to_vec(),
@@ -513,7 +421,7 @@ impl Shell<'_> {
             _ => 0.0,
         };
         let error = match (prepared, self.outcome.take()) {
-            (Err(error), _) => error,
+            (Err(error), _) => *error,
             (Ok(()), Some(Outcome::Complete)) if self.slots.iter().all(Option::is_some) => {
                 let frames: Vec<CapturedFrame> =
                     std::mem::take(&mut self.slots).into_iter().flatten().collect();
@@ -525,7 +433,7 @@ impl Shell<'_> {
                 return Ok(self.record(frames, retaken, seconds, statistics, notes));
             }
             (Ok(()), Some(Outcome::Cancelled)) => CaptureError::Cancelled,
-            (Ok(()), Some(Outcome::Failed(diagnosis))) => diagnosed(diagnosis),
+            (Ok(()), Some(Outcome::Failed(diagnosis))) => diagnosis.into(),
             (Ok(()), Some(Outcome::Complete) | None) => CaptureError::Diagnosed {
                 reason: "out-of-order".to_string(),
                 role: None,
@@ -572,14 +480,6 @@ impl Shell<'_> {
             }
         }
         pairs
-    }
-}
-
-fn diagnosed(diagnosis: Diagnosis) -> CaptureError {
-    let Diagnosis { reason, role, evidence, source } = diagnosis;
-    match source {
-        Some((device, source)) => CaptureError::Device { device, reason, role, evidence, source },
-        None => CaptureError::Diagnosed { reason, role, evidence },
     }
 }
 

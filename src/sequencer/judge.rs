@@ -33,8 +33,9 @@ pub enum PairVerdict {
 
 /// Looks at frames as they arrive. Called from the capture's thread while the next slide's light is under way.
 pub trait Judge {
-    /// An accepted frame of the first set of references, before any pair that is judged against it. Called again for
-    /// the last set.
+    /// An accepted frame of a reference: of the first set before any pair that is judged against it, and of the last
+    /// set. One of the first set may be taken again; a later frame of a role takes the place of the earlier. Quick:
+    /// an exposure may be waiting.
     fn reference(&mut self, role: Role, frame: &Frame);
 
     /// The frame and the inverse of one bit.

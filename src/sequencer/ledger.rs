@@ -55,13 +55,6 @@ impl Flips {
         receipt: PresentReceipt,
     ) -> Result<(), Refusal> {
         let flipped = receipt.flipped;
-        if receipt.slide != Some(slide) {
-            let shown = receipt.slide.map_or("black".to_string(), |shown| format!("slide {shown}"));
-            return Err(Refusal::new(
-                "wrong-slide",
-                format!("asked for slide {slide}, the receipt names {shown}"),
-            ));
-        }
         // A recording's times are its own.
         if receipt.method != ReceiptMethod::Recorded {
             let latest = now + timing.refresh_period * FLIPS_AHEAD;
@@ -92,7 +85,15 @@ impl Flips {
                 }
             }
         }
+        // A flip to another slide is a flip all the same: no later receipt may claim it.
         self.last = Some(receipt);
+        if receipt.slide != Some(slide) {
+            let shown = receipt.slide.map_or("black".to_string(), |shown| format!("slide {shown}"));
+            return Err(Refusal::new(
+                "wrong-slide",
+                format!("asked for slide {slide}, the receipt names {shown}"),
+            ));
+        }
         Ok(())
     }
 }

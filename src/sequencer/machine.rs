@@ -22,6 +22,8 @@
 //! holds; a frame is kept only where its stamp lies in the stable window of the slide on the glass; `Black` and `Finish`
 //! come once, together, last. Re-takes and discarded frames are bounded, so the number of actions is.
 
+mod types;
+
 use std::collections::VecDeque;
 
 use polscan_drivers::{
@@ -39,139 +41,13 @@ use super::{
     record::Finding,
 };
 
+pub use types::{Action, Device, Diagnosis, Event, GroupRetake, Outcome, Subject};
+
 /// Frames that may be discarded while one is awaited.
 pub const MAX_DISCARDED: u32 = 8;
 
-/// Which device failed.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Device {
-    /// While showing a slide.
-    Projector,
-    /// While triggering or delivering.
-    Camera,
-}
-
-/// What the judge looks at.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Subject {
-    /// The two frames of a pair, of group `group`.
-    Pair {
-        /// Index into the plan's groups.
-        group: usize,
-    },
-    /// The last frame of a reference against the first, of group `group`.
-    Drift {
-        /// Index into the plan's groups.
-        group: usize,
-    },
-}
-
-impl Subject {
-    /// Group that is judged.
-    pub fn group(self) -> usize {
-        match self {
-            Self::Pair { group } | Self::Drift { group } => group,
-        }
-    }
-}
-
-/// What happened.
-#[derive(Debug, Clone, PartialEq)]
-pub enum Event {
-    /// Begin.
-    Start,
-    /// The slide asked for was flipped.
-    Presented(PresentReceipt),
-    /// The exposure asked for starts, or has started, at this time.
-    Triggered(Timestamp),
-    /// A frame arrived.
-    FrameArrived(FrameStamp),
-    /// The judge has spoken.
-    Judged(Subject, PairVerdict),
-    /// No frame arrived by the deadline.
-    TimedOut,
-    /// A device failed at the action asked for.
-    DeviceFailed(Device, DeviceError),
-    /// The user wants no more of it.
-    CancelRequested,
-}
-
-/// What to do, in this order.
-#[derive(Debug, Clone, PartialEq)]
-pub enum Action {
-    /// Show the slide of `step`, not before a time.
-    Show {
-        /// Step and slide.
-        step: usize,
-        /// Earliest time to ask for it.
-        not_before: Timestamp,
-    },
-    /// Start one exposure.
-    Trigger {
-        /// When.
-        at: Timestamp,
-    },
-    /// Wait for a frame.
-    AwaitFrame {
-        /// Until when.
-        deadline: Timestamp,
-    },
-    /// The frame that has just arrived is the one of `step`. One that arrived without this is to be dropped.
-    Keep {
-        /// Step that it shows.
-        step: usize,
-    },
-    /// Judge, and answer with [`Event::Judged`].
-    Judge(Subject),
-    /// The frames of this group are final.
-    Accept {
-        /// Index into the plan's groups.
-        group: usize,
-    },
-    /// The group will be taken again: a notice, [`Machine::retaken`] has it.
-    Retake(GroupRetake),
-    /// Leave the projector black.
-    Black,
-    /// The capture is over.
-    Finish(Outcome),
-}
-
-/// A group that is taken again.
-#[derive(Debug, Clone, PartialEq)]
-pub struct GroupRetake {
-    /// Index into the plan's groups.
-    pub group: usize,
-    /// Slug of the diagnosis.
-    pub reason: String,
-    /// Evidence in words.
-    pub evidence: String,
-    /// Which try failed, from 1.
-    pub attempt: u32,
-}
-
-/// How a capture ended.
-#[derive(Debug, Clone, PartialEq)]
-pub enum Outcome {
-    /// All frames are proven.
-    Complete,
-    /// Cancelled by the user.
-    Cancelled,
-    /// Given up.
-    Failed(Diagnosis),
-}
-
-/// Why a capture was given up.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Diagnosis {
-    /// Slug.
-    pub reason: String,
-    /// What was being captured.
-    pub role: Option<Role>,
-    /// Evidence in words.
-    pub evidence: String,
-    /// Failure of a device, where that is the cause.
-    pub source: Option<(Device, DeviceError)>,
-}
+/// Refused pairs, with none accepted, that put the references they were judged against in doubt.
+const DOUBTFUL_REFERENCES: u32 = 2;
 
 #[derive(Debug, Clone, PartialEq)]
 enum Phase {
@@ -211,6 +87,11 @@ pub struct Machine {
     discarded: Vec<Finding>,
     flips: Flips,
     exposures: Exposures,
+    exposed: Timestamp,
+    /// Whether a pair has agreed with the references.
+    references_hold: bool,
+    refused_pairs: u32,
+    references_repeated: bool,
 }
 
 impl Machine {
@@ -232,6 +113,10 @@ impl Machine {
             discarded: Vec::new(),
             flips: Flips::default(),
             exposures: Exposures::new(triggered),
+            exposed: Timestamp(0),
+            references_hold: false,
+            refused_pairs: 0,
+            references_repeated: false,
         }
     }
 
@@ -302,10 +187,16 @@ impl Machine {
         }
     }
 
+    /// Shows `step` when the slide before has been held as planned.
     fn show(&mut self, now: Timestamp, group: usize, step: usize) -> Action {
-        self.current = Some((group, step));
         let due = self.flips.last().map(|receipt| self.timing.next_show(self.timing.latest_flip(receipt)));
-        let not_before = due.unwrap_or(now).max(now);
+        self.show_from(due.unwrap_or(now).max(now), group, step)
+    }
+
+    fn show_from(&mut self, not_before: Timestamp, group: usize, step: usize) -> Action {
+        // Also where nobody waits for its frame any more, an exposure is not disturbed.
+        let not_before = not_before.max(self.exposed);
+        self.current = Some((group, step));
         self.phase = Phase::Showing { asked: not_before };
         Action::Show { step, not_before }
     }
@@ -344,6 +235,7 @@ impl Machine {
 
     fn triggered(&mut self, at: Timestamp, started: Timestamp) -> Vec<Action> {
         self.exposures.trigger();
+        self.exposed = at.max(started) + self.timing.exposure;
         let deadline = self.timing.frame_deadline(at.max(started));
         self.phase =
             Phase::Awaiting(Wait { window: Window { at, started }, deadline, discarded: 0, last: None });
@@ -422,6 +314,8 @@ impl Machine {
             evidence: suspicion.evidence,
             sigma: Some(suspicion.sigma),
         };
+        let refused = matches!(verdict, PairVerdict::Retake(_));
+        self.references_hold |= matches!(subject, Subject::Pair { .. }) && !refused;
         let mut actions = match verdict {
             PairVerdict::Accept => vec![Action::Accept { group }],
             PairVerdict::Degraded(suspicion) => {
@@ -429,8 +323,7 @@ impl Machine {
                 vec![Action::Accept { group }]
             }
             PairVerdict::Retake(suspicion) if self.may_repeat(group) => {
-                self.queue.push_front(group);
-                vec![self.enter_retake(group, suspicion.reason, suspicion.evidence)]
+                self.repeat_judged(subject, suspicion)
             }
             // What has changed since the first references stays changed: the scan says so and stands.
             PairVerdict::Retake(suspicion) if matches!(subject, Subject::Drift { .. }) => {
@@ -452,6 +345,33 @@ impl Machine {
             Phase::Shown { flip } => actions.push(self.expose(now, flip)),
             Phase::Judging => actions.extend(self.advance(now)),
             phase => self.phase = phase,
+        }
+        actions
+    }
+
+    /// Takes what was judged again, when the group under way is complete; the first references too where no pair
+    /// so far agrees with them.
+    fn repeat_judged(&mut self, subject: Subject, suspicion: Suspicion) -> Vec<Action> {
+        let group = subject.group();
+        let mut actions = vec![self.enter_retake(group, suspicion.reason.clone(), suspicion.evidence)];
+        let is_reference = |machine: &Self, group: usize| {
+            let role = machine.roles[machine.groups[group].steps().start];
+            matches!(machine.groups[group], Group::Single { .. }) && !matches!(role, Role::Code { .. })
+        };
+        // Behind references that are to be repeated: it is judged against them.
+        let place = self.queue.iter().take_while(|&&queued| is_reference(self, queued)).count();
+        self.queue.insert(place, group);
+        self.refused_pairs += u32::from(matches!(subject, Subject::Pair { .. }));
+        if self.refused_pairs < DOUBTFUL_REFERENCES || self.references_hold || self.references_repeated {
+            return actions;
+        }
+        self.references_repeated = true;
+        for reference in (0..self.groups.len()).rev() {
+            if is_reference(self, reference) && self.may_repeat(reference) {
+                self.queue.push_front(reference);
+                let evidence = format!("the first {} pairs do not agree with it", self.refused_pairs);
+                actions.push(self.enter_retake(reference, suspicion.reason.clone(), evidence));
+            }
         }
         actions
     }
@@ -486,14 +406,14 @@ impl Machine {
         self.repeat(now, reason, error.to_string())
     }
 
-    /// Takes the current group again from its first step, or gives up.
+    /// Takes the current group again from its first step, at once, or gives up.
     fn repeat(&mut self, now: Timestamp, reason: &str, evidence: String) -> Vec<Action> {
         match self.current {
             Some((group, step)) if self.may_repeat(group) => {
                 let evidence = format!("{}: {evidence}", self.roles[step]);
                 let notice = self.enter_retake(group, reason.to_string(), evidence);
                 let step = self.groups[group].steps().start;
-                vec![notice, self.show(now, group, step)]
+                vec![notice, self.show_from(now, group, step)]
             }
             Some((group, _)) => {
                 let evidence = self.with_tries(group, evidence);

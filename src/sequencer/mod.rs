@@ -3,13 +3,15 @@
 //! [`Plan`] is the timetable, [`Machine`](machine::Machine) decides, [`capture`] does; [`Judge`] looks at the pixels.
 
 mod capture;
+mod failure;
 mod judge;
 mod ledger;
 pub mod machine;
 pub mod plan;
 mod record;
 
-pub use capture::{CancelFlag, CaptureError, CaptureFailure, PartialCapture, Progress, capture, slide};
+pub use capture::{CancelFlag, Progress, capture, slide};
+pub use failure::{CaptureError, CaptureFailure, PartialCapture};
 pub use judge::{
     Judge, PairThresholds, PairVerdict, ReferenceChange, Suspicion, compare_references, drift_rule,
     judge_rule,

@@ -118,7 +118,11 @@ impl SimCamera {
             return Ok(region);
         }
         let Region { x, y, width: w, height: h } = region;
-        Err(self.refused("region", format!("{w} x {h} at ({x}, {y})"), format!("a sensor of {width} x {height}")))
+        Err(self.refused(
+            "region",
+            format!("{w} x {h} at ({x}, {y})"),
+            format!("a sensor of {width} x {height}"),
+        ))
     }
 }
 

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 
-use super::faults::Faults;
+use super::{faults::Faults, panel::WIDEST_BLUR_PX};
 use crate::clock::{Clock, MonotonicClock, VirtualClock};
 
 /// A simulated rig. Lengths in mm in the camera's frame (x right, y down, z forward), pixel centres at integers,
@@ -305,7 +305,7 @@ impl CameraDescription {
         {
             faults.finite(&format!("camera.{name}"), value);
         }
-        faults.within("camera.blur_px", self.blur_px, 0.0, 20.0);
+        faults.within("camera.blur_px", self.blur_px, 0.0, WIDEST_BLUR_PX);
         faults.above("camera.full_well_e", self.full_well_e, 0.0);
         faults.at_least("camera.read_noise_e", self.read_noise_e, 0.0);
         faults.at_least("camera.dark_current_e_per_s", self.dark_current_e_per_s, 0.0);
@@ -338,7 +338,7 @@ impl ProjectorDescription {
         {
             faults.finite(&format!("projector.{name}"), value);
         }
-        faults.within("projector.blur_px", self.blur_px, 0.0, 20.0);
+        faults.within("projector.blur_px", self.blur_px, 0.0, WIDEST_BLUR_PX);
         for (channel, &value) in self.extinction.iter().enumerate() {
             faults.at_least(&format!("projector.extinction[{channel}]"), value, 1.0);
         }
@@ -375,7 +375,8 @@ impl PoseDescription {
                 let error = (rotation * rotation.transpose() - nalgebra::Matrix3::identity()).norm();
                 // Not `>`: a NaN must fail too.
                 if !(error <= 1e-6 && rotation.determinant() > 0.0) {
-                    faults.add("pose.rotation", "is not a rotation: rows must be orthonormal and right-handed");
+                    faults
+                        .add("pose.rotation", "is not a rotation: rows must be orthonormal and right-handed");
                 }
                 for (axis, &value) in translation.iter().enumerate() {
                     faults.finite(&format!("pose.translation_mm[{axis}]"), value);

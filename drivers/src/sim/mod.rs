@@ -35,6 +35,8 @@ mod render;
 mod rig;
 mod scene;
 mod surface;
+#[cfg(test)]
+mod testing;
 mod timeline;
 mod worker;
 mod world;

@@ -9,6 +9,10 @@ use crate::projector::{Rgb, Slide};
 /// Entries of a profile table per projector pixel. Linear interpolation of the profile of an edge with blur s (px) is
 /// then off by at most 7e-6 / s^2.
 const PER_PIXEL: usize = 64;
+/// Bits of a position below a whole entry.
+const FRACTION_BITS: u32 = 11;
+/// Widest blur that descriptions may have, in px.
+pub(crate) const WIDEST_BLUR_PX: f64 = 20.0;
 
 /// Light per channel: red, green, blue, nothing. The fourth keeps the compiler's vectors whole.
 pub(crate) type Channels = [f32; 4];
@@ -85,24 +89,50 @@ impl Panel {
     /// Table of one axis from the light of its pixels.
     fn table(&self, axis: usize, lights: &[[f64; 3]]) -> Table {
         let margin = self.margin();
-        let entries = (self.size[axis] + 2 * margin) * PER_PIXEL + 1;
+        let entries = (self.size[axis] + 2 * margin) * PER_PIXEL + 2;
         let mut values = vec![[0.0f32; 4]; entries];
         for channel in 0..3 {
-            let shift = self.shift_px[channel][axis];
+            // Channels of one polarization mostly show the same.
+            let twin = (0..channel).find(|&other| {
+                self.shift_px[other][axis] == self.shift_px[channel][axis]
+                    && lights.iter().all(|light| light[other] == light[channel])
+            });
+            if let Some(twin) = twin {
+                values.iter_mut().for_each(|value| value[channel] = value[twin]);
+                continue;
+            }
+            let column: Vec<f64> = lights.iter().map(|light| light[channel]).collect();
+            let start = -(margin as f64) - self.shift_px[channel][axis];
             // The weights of the neighbours repeat from pixel to pixel.
-            for phase in 0..PER_PIXEL {
-                let base = phase as f64 / PER_PIXEL as f64 - margin as f64 - shift;
-                let first = base.floor() as i64 - self.reach as i64;
-                let weights: Vec<f64> = (0..2 * self.reach as i64 + 2)
-                    .map(|neighbour| blurred_box(base - (first + neighbour) as f64, self.blur_px))
-                    .collect();
-                for (pixel, entry) in (phase..entries).step_by(PER_PIXEL).enumerate() {
-                    let start = first + pixel as i64;
-                    values[entry][channel] = weighted(lights, channel, start, &weights) as f32;
+            let phases: Vec<(i64, Vec<f64>)> = (0..PER_PIXEL)
+                .map(|phase| self.neighbours(start + phase as f64 / PER_PIXEL as f64))
+                .collect();
+            for (pixel, entries) in values.chunks_mut(PER_PIXEL).enumerate() {
+                for (entry, (first, weights)) in entries.iter_mut().zip(&phases) {
+                    entry[channel] = weighted(&column, first + pixel as i64, weights) as f32;
                 }
             }
         }
-        Table { values, offset: (margin * PER_PIXEL) as f32 }
+        Table { values }
+    }
+
+    /// Pixels that give light at a coordinate: the first of them, and the weights from there on.
+    fn neighbours(&self, at: f64) -> (i64, Vec<f64>) {
+        let first = at.floor() as i64 - self.reach as i64;
+        let count = 2 * self.reach as i64 + 2;
+        (first, (first..first + count).map(|pixel| blurred_box(at - pixel as f64, self.blur_px)).collect())
+    }
+
+    /// Position of a nominal coordinate in the tables of an axis: whole entries, and a fraction in the low bits.
+    pub(crate) fn position(&self, axis: usize, at: f64) -> u32 {
+        let margin = self.margin() as f64;
+        let within = at.clamp(-margin, self.size[axis] as f64 + margin) + margin;
+        (within * (PER_PIXEL << FRACTION_BITS) as f64).round() as u32
+    }
+
+    /// The coordinate of a position.
+    fn coordinate(&self, position: u32) -> f64 {
+        f64::from(position) / (PER_PIXEL << FRACTION_BITS) as f64 - self.margin() as f64
     }
 
     /// Pixels around the panel that tables cover.
@@ -140,27 +170,31 @@ impl Panel {
             constant: [constant[0] as f32, constant[1] as f32, constant[2] as f32, 0.0],
             columns: columns.map(|lights| self.table(0, &lights)),
             rows: rows.map(|lights| self.table(1, &lights)),
-            full: (!full.is_empty()).then(|| Full { panel: self.clone(), slides: full }),
+            full: (!full.is_empty()).then(|| Full::new(self, &full)),
         }
     }
 }
 
 /// Weighted mean of the pixels from `start` on, over those that exist. Weights of missing pixels are left out of the
 /// mean because the fall-off at the border is part of [`Panel::coverage`].
-fn weighted(lights: &[[f64; 3]], channel: usize, start: i64, weights: &[f64]) -> f64 {
+fn weighted(lights: &[f64], start: i64, weights: &[f64]) -> f64 {
+    let last = lights.len() as i64 - 1;
+    if start >= 0 && start + weights.len() as i64 - 1 <= last {
+        let seen = &lights[start as usize..start as usize + weights.len()];
+        return seen.iter().zip(weights).map(|(light, weight)| light * weight).sum();
+    }
     let (mut sum, mut total) = (0.0, 0.0);
-    for (neighbour, weight) in weights.iter().enumerate() {
-        let index = start + neighbour as i64;
-        if let Some(light) = usize::try_from(index).ok().and_then(|index| lights.get(index)) {
-            sum += weight * light[channel];
+    for (index, weight) in (start..).zip(weights) {
+        if (0..=last).contains(&index) {
+            sum += weight * lights[index as usize];
             total += weight;
         }
     }
+    // Beyond the reach of the last pixel it does not matter which value is taken: nothing is lit there.
     if total > 1e-9 {
         sum / total
     } else {
-        let middle = start + weights.len() as i64 / 2;
-        lights[middle.clamp(0, lights.len() as i64 - 1) as usize][channel]
+        lights[(start + weights.len() as i64 / 2).clamp(0, last) as usize]
     }
 }
 
@@ -168,16 +202,14 @@ fn weighted(lights: &[[f64; 3]], channel: usize, start: i64, weights: &[f64]) ->
 #[derive(Debug, Clone)]
 pub(crate) struct Table {
     values: Vec<Channels>,
-    offset: f32,
 }
 
 impl Table {
-    /// Light at coordinate `at`; the border's value outside, anything for NaN.
+    /// Light at a [`Panel::position`].
     #[inline]
-    pub(crate) fn at(&self, at: f32) -> Channels {
-        let position = (at * PER_PIXEL as f32 + self.offset).clamp(0.0, (self.values.len() - 2) as f32);
-        let index = (position as usize).min(self.values.len() - 2);
-        let share = position - index as f32;
+    pub(crate) fn at(&self, position: u32) -> Channels {
+        let index = (position >> FRACTION_BITS) as usize;
+        let share = (position & ((1 << FRACTION_BITS) - 1)) as f32 * (1.0 / (1 << FRACTION_BITS) as f32);
         let (low, high) = (self.values[index], self.values[index + 1]);
         std::array::from_fn(|channel| low[channel] + share * (high[channel] - low[channel]))
     }
@@ -192,63 +224,237 @@ pub(crate) struct Illumination {
     pub(crate) full: Option<Full>,
 }
 
-/// Slides without structure, convolved at each look-up.
+/// Slides without structure, summed up and convolved at each look-up.
 #[derive(Debug, Clone)]
 pub(crate) struct Full {
     panel: Panel,
-    slides: Vec<(Arc<[Rgb]>, f64)>,
+    /// Row-major, per channel.
+    light: [Vec<f32>; 3],
+    /// Weights of the neighbours at each phase and, for interpolation, the next.
+    phases: Vec<Vec<f32>>,
 }
 
 impl Full {
-    /// Light at a nominal projector coordinate; nothing for NaN.
-    pub(crate) fn at(&self, u: f32, v: f32) -> Channels {
+    fn new(panel: &Panel, slides: &[(Arc<[Rgb]>, f64)]) -> Self {
+        let pixels = panel.size[0] * panel.size[1];
+        let light = std::array::from_fn(|channel| {
+            let mut light = vec![0.0f32; pixels];
+            for (values, weight) in slides {
+                let levels: Vec<f32> = (0..=255).map(|code| (weight * panel.light(code)) as f32).collect();
+                light
+                    .iter_mut()
+                    .zip(values.iter())
+                    .for_each(|(sum, rgb)| *sum += levels[usize::from(rgb[channel])]);
+            }
+            light
+        });
+        let weights = |phase: usize| {
+            let (_, weights) = panel.neighbours(phase as f64 / PER_PIXEL as f64);
+            weights.into_iter().map(|weight| weight as f32).collect()
+        };
+        let mut phases: Vec<Vec<f32>> = (0..PER_PIXEL).map(weights).collect();
+        // One pixel on the same neighbours, counted from the first phase's first, end with that pixel's weights.
+        let mut wrapped = phases[0].clone();
+        wrapped.rotate_right(1);
+        phases.push(wrapped);
+        Self { panel: panel.clone(), light, phases }
+    }
+
+    /// Light at the positions of both axes.
+    pub(crate) fn at(&self, column: u32, row: u32) -> Channels {
         let mut light = [0.0f32; 4];
-        if !(u.is_finite() && v.is_finite()) {
-            return light;
-        }
-        for (channel, light) in light.iter_mut().take(3).enumerate() {
-            let across = self.weights(channel, 0, f64::from(u));
-            let down = self.weights(channel, 1, f64::from(v));
-            let total = across.1.iter().sum::<f64>() * down.1.iter().sum::<f64>();
-            if total < 1e-12 {
-                continue;
-            }
-            let width = self.panel.size[0];
-            for (values, weight) in &self.slides {
-                let mut sum = 0.0;
-                for (y, wy) in down.1.iter().enumerate() {
-                    let row = &values[(down.0 + y) * width + across.0..];
-                    sum += wy
-                        * across.1.iter().zip(row).map(|(wx, rgb)| wx * self.panel.light(rgb[channel])).sum::<f64>();
+        let (u, v) = (self.panel.coordinate(column), self.panel.coordinate(row));
+        let [width, height] = self.panel.size;
+        for channel in 0..3 {
+            let [dx, dy] = self.panel.shift_px[channel];
+            let across = self.neighbours(u - dx, width);
+            let down = self.neighbours(v - dy, height);
+            let (mut sum, mut total) = (0.0, 0.0);
+            for (line, wy) in down.pixels.clone().zip(down.weights()) {
+                let values = &self.light[channel][line * width..(line + 1) * width][across.pixels.clone()];
+                let (mut partial, mut share) = (0.0, 0.0);
+                for (value, wx) in values.iter().zip(across.weights()) {
+                    partial += value * wx;
+                    share += wx;
                 }
-                *light += (weight * sum / total) as f32;
+                sum += wy * partial;
+                total += wy * share;
             }
+            light[channel] = if total > 1e-9 { sum / total } else { 0.0 };
         }
         light
     }
 
-    /// First pixel that matters along an axis, and the weights from there.
-    fn weights(&self, channel: usize, axis: usize, at: f64) -> (usize, Vec<f64>) {
-        let at = at - self.panel.shift_px[channel][axis];
-        let last = self.panel.size[axis] as f64 - 1.0;
-        let first = (at.round() - self.panel.reach as f64).clamp(0.0, last) as usize;
-        let end = (at.round() + self.panel.reach as f64).clamp(0.0, last) as usize;
-        (first, (first..=end).map(|pixel| blurred_box(at - pixel as f64, self.panel.blur_px)).collect())
+    /// Pixels of an axis of `size` pixels that give light at a coordinate.
+    fn neighbours(&self, at: f64, size: usize) -> Neighbours<'_> {
+        let whole = at.floor();
+        let phase = (at - whole) * PER_PIXEL as f64;
+        let index = (phase as usize).min(PER_PIXEL - 1);
+        let first = whole as i64 - self.panel.reach as i64;
+        let end = first + self.phases[index].len() as i64;
+        let pixels = first.clamp(0, size as i64) as usize..end.clamp(0, size as i64) as usize;
+        let skip = (pixels.start as i64 - first) as usize;
+        Neighbours {
+            pixels,
+            low: &self.phases[index][skip.min(self.phases[index].len())..],
+            high: &self.phases[index + 1][skip.min(self.phases[index].len())..],
+            share: (phase - index as f64) as f32,
+        }
+    }
+}
+
+/// Pixels that exist, and their weights between two phases.
+struct Neighbours<'a> {
+    pixels: std::ops::Range<usize>,
+    low: &'a [f32],
+    high: &'a [f32],
+    share: f32,
+}
+
+impl Neighbours<'_> {
+    fn weights(&self) -> impl Iterator<Item = f32> {
+        self.low.iter().zip(self.high).map(|(low, high)| low + self.share * (high - low))
     }
 }
 
 impl Illumination {
-    /// Light at a nominal projector coordinate.
-    pub(crate) fn at(&self, u: f32, v: f32) -> Channels {
+    /// Light at the positions of both axes.
+    pub(crate) fn at(&self, column: u32, row: u32) -> Channels {
         let mut light = self.constant;
         let parts = [
-            self.columns.as_ref().map(|table| table.at(u)),
-            self.rows.as_ref().map(|table| table.at(v)),
-            self.full.as_ref().map(|full| full.at(u, v)),
+            self.columns.as_ref().map(|table| table.at(column)),
+            self.rows.as_ref().map(|table| table.at(row)),
+            self.full.as_ref().map(|full| full.at(column, row)),
         ];
         for part in parts.into_iter().flatten() {
             light.iter_mut().zip(part).for_each(|(light, part)| *light += part);
         }
         light
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::sim::description::PanelPolarization;
+    use proptest::prelude::*;
+
+    fn description(size: [u32; 2], blur_px: f64, shift: [f64; 2]) -> ProjectorDescription {
+        ProjectorDescription {
+            size,
+            focal_px: 1000.0,
+            principal_point_px: None,
+            k1: 0.0,
+            k2: 0.0,
+            p1: 0.0,
+            p2: 0.0,
+            k3: 0.0,
+            blur_px,
+            polarization: [PanelPolarization::None; 3],
+            extinction: [1.0; 3],
+            response: [1.0; 3],
+            black_leak: 0.01,
+            gamma: 2.2,
+            panel_shift_px: [shift, [0.0, 0.0], [-0.3, 0.1]],
+            lcd_10_90_ms: 0.0,
+            latency_refreshes: 0,
+            refresh_hz: 60.0,
+            states_timing: true,
+        }
+    }
+
+    /// Light by brute force: each pixel's box and the normal distribution, integrated by the midpoint rule on a plane
+    /// that is infinite and dark outside, over the same of a picture at full drive.
+    fn oracle(panel: &Panel, light: impl Fn(usize, usize) -> f64, channel: usize, at: [f64; 2]) -> f64 {
+        let fine = 400;
+        let weight = |axis: usize, pixel: usize| {
+            let x = at[axis] - panel.shift_px[channel][axis] - pixel as f64;
+            let density = |d: f64| (-0.5 * (d / panel.blur_px).powi(2)).exp();
+            (0..fine).map(|step| density(x - (f64::from(step) + 0.5) / f64::from(fine) + 0.5)).sum::<f64>()
+                / f64::from(fine)
+                / (panel.blur_px * std::f64::consts::TAU.sqrt())
+        };
+        let (mut sum, mut total) = (0.0, 0.0);
+        let across: Vec<f64> = (0..panel.size[0]).map(|x| weight(0, x)).collect();
+        for y in 0..panel.size[1] {
+            let down = weight(1, y);
+            for (x, across) in across.iter().enumerate() {
+                sum += across * down * light(x, y);
+                total += across * down;
+            }
+        }
+        sum / total
+    }
+
+    fn code(x: usize, y: usize) -> Rgb {
+        let word = crate::sim::noise::mix((x * 31 + y) as u64);
+        [word as u8, (word >> 8) as u8 & 0x80, if word & 0x10000 == 0 { 0 } else { 255 }]
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(60))]
+        #[test]
+        fn tables_and_look_ups_agree_with_brute_force(
+            u in -1.0f64..24.0, v in -1.0f64..18.0, blur in 0.4f64..1.5, dx in -1.0f64..1.0,
+        ) {
+            let panel = Panel::new(&description([24, 18], blur, [dx, 0.4]));
+            let columns: Arc<[Rgb]> = (0..24).map(|x| code(x, 0)).collect();
+            let rows: Arc<[Rgb]> = (0..18).map(|y| code(3, y)).collect();
+            let full: Arc<[Rgb]> = (0..18).flat_map(|y| (0..24).map(move |x| code(x, y))).collect();
+            type Pick = fn(usize, usize) -> Rgb;
+            let cases: [(Slide, Pick); 4] = [
+                (Slide::Columns(columns), |x, _| code(x, 0)),
+                (Slide::Rows(rows), |_, y| code(3, y)),
+                (Slide::Full(full), code),
+                (Slide::Uniform([200, 0, 255]), |_, _| [200, 0, 255]),
+            ];
+            let position = [panel.position(0, u), panel.position(1, v)];
+            for (slide, pick) in cases {
+                let ours = panel.illuminate(&vec![(Arc::new(slide), 1.0)]).at(position[0], position[1]);
+                for channel in 0..3 {
+                    let light = |x, y| panel.light(pick(x, y)[channel]);
+                    let expected = oracle(&panel, light, channel, [u, v]);
+                    prop_assert!((f64::from(ours[channel]) - expected).abs() < 1e-4, "{} {expected}", ours[channel]);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn mixtures_are_sums() {
+        let panel = Panel::new(&description([24, 18], 0.6, [0.2, 0.0]));
+        let columns = Arc::new(Slide::Columns((0..24).map(|x| code(x, 0)).collect()));
+        let rows = Arc::new(Slide::Rows((0..18).map(|y| code(3, y)).collect()));
+        let uniform = Arc::new(Slide::Uniform([10, 255, 0]));
+        let mixture = vec![(columns.clone(), 0.5), (rows.clone(), 0.2), (uniform.clone(), 0.3)];
+        let (u, v) = (panel.position(0, 7.31), panel.position(1, 11.8));
+        let together = panel.illuminate(&mixture).at(u, v);
+        for channel in 0..3 {
+            let sum: f32 = mixture
+                .iter()
+                .map(|(slide, weight)| {
+                    *weight as f32 * panel.illuminate(&vec![(slide.clone(), 1.0)]).at(u, v)[channel]
+                })
+                .sum();
+            assert!((together[channel] - sum).abs() < 1e-6);
+        }
+    }
+
+    #[test]
+    fn boxes_add_up_and_borders_fall_off() {
+        for blur in [0.0, 0.3, 0.6, 2.0] {
+            let sum: f64 = (-30..=30).map(|pixel| blurred_box(0.37 - f64::from(pixel), blur)).sum();
+            assert!((sum - 1.0).abs() < 1e-12, "{blur}: {sum}");
+            let panel = Panel::new(&description([24, 18], blur, [0.0, 0.0]));
+            assert!((panel.coverage(1, [12.0, 9.0]) - 1.0).abs() < 1e-4);
+            assert!((panel.coverage(1, [-0.5, 9.0]) - 0.5).abs() < 1e-4);
+            assert!(panel.coverage(1, [-0.5 - 6.0 * blur - 0.01, 9.0]) < 1e-8);
+        }
+        // Full contrast without blur.
+        let panel = Panel::new(&description([4, 4], 0.0, [0.0, 0.0]));
+        let slide = Slide::Columns([[0; 3], [255; 3], [0; 3], [255; 3]].into());
+        let light = panel.illuminate(&vec![(Arc::new(slide), 1.0)]);
+        let at = |u| light.at(panel.position(0, u), panel.position(1, 1.0))[1];
+        assert!((at(0.45) - 0.01).abs() < 1e-6 && (at(0.55) - 1.0).abs() < 1e-6);
     }
 }

@@ -8,6 +8,7 @@ use crate::{
     error::DeviceError,
     projector::{
         PresentReceipt, Projector, ProjectorDriver, ProjectorInfo, ProjectorTiming, ReceiptMethod, Slide,
+        check_slide, no_such_slide,
     },
 };
 
@@ -82,36 +83,6 @@ impl SimProjector {
         };
         shared.clock.sleep_until(flipped);
         PresentReceipt { slide: index, flipped, refresh: Some(refresh), method: ReceiptMethod::Simulated }
-    }
-}
-
-/// Refuses a slide that is not of the projector's native size.
-pub(crate) fn check_slide(info: &ProjectorInfo, number: usize, slide: &Slide) -> Result<(), DeviceError> {
-    let (width, height) = (info.width as usize, info.height as usize);
-    let (kind, has, needs) = match slide {
-        Slide::Uniform(_) => return Ok(()),
-        Slide::Columns(values) => ("columns", values.len(), width),
-        Slide::Rows(values) => ("rows", values.len(), height),
-        Slide::Full(values) => ("pixels", values.len(), width * height),
-    };
-    if has == needs {
-        return Ok(());
-    }
-    Err(DeviceError::Refused {
-        device: info.serial.clone(),
-        setting: "slide size",
-        requested: format!("{has} {kind} in slide {number}"),
-        offered: format!("{needs} ({width} x {height})"),
-    })
-}
-
-/// The refusal of a slide number that is not loaded.
-pub(crate) fn no_such_slide(info: &ProjectorInfo, index: u32, loaded: usize) -> DeviceError {
-    DeviceError::Refused {
-        device: info.serial.clone(),
-        setting: "slide number",
-        requested: index.to_string(),
-        offered: format!("{loaded} slides, numbered from 0"),
     }
 }
 

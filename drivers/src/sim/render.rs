@@ -128,7 +128,7 @@ impl Renderer {
         self.blurred_rows(exposure, response, &mut plane);
         let width = response.region.width as usize;
         let stream = Stream::new(self.seed, exposure.number);
-        let develop = Developer::new(self, response);
+        let developer = Developer::new(self, response);
         samples.par_chunks_mut(width).enumerate().for_each_init(
             || vec![0.0f32; width],
             |row, (y, out)| {
@@ -139,11 +139,9 @@ impl Renderer {
                 }
                 let first = (u64::from(response.region.y) + y as u64) * u64::from(self.camera.size[0])
                     + u64::from(response.region.x);
-                let pattern = self.pattern.as_ref().map(|pattern| &pattern[first as usize..]);
-                for (x, (light, out)) in row.iter().zip(out).enumerate() {
-                    let own = pattern.map(|pattern| pattern[x]);
-                    *out = sample(develop.develop(stream, first + x as u64, *light, own));
-                }
+                let pattern = self.pattern.as_ref().map(|pattern| &pattern[first as usize..][..width]);
+                developer.develop(stream, first, row, pattern);
+                out.iter_mut().zip(row.iter()).for_each(|(out, dn)| *out = sample(*dn));
             },
         );
     }
@@ -179,34 +177,37 @@ fn kernel(blur_px: f64) -> Vec<f32> {
         return vec![1.0];
     }
     let reach = reach_px(blur_px) as i32;
-    let weights: Vec<f64> =
-        (-reach..=reach).map(|offset| blurred_box(f64::from(offset), blur_px)).collect();
+    let weights: Vec<f64> = (-reach..=reach).map(|offset| blurred_box(f64::from(offset), blur_px)).collect();
     let total: f64 = weights.iter().sum();
     weights.into_iter().map(|weight| (weight / total) as f32).collect()
 }
 
-fn dot(gain: Channels, light: Channels) -> f32 {
+fn dot(gain: [f32; 3], light: Channels) -> f32 {
     gain[0] * light[0] + gain[1] * light[1] + gain[2] * light[2]
 }
 
 /// Light of a row of views; the common kinds of slides have loops of their own.
 fn light_row(illumination: &Illumination, views: &[View], row: &mut [f32]) {
     let constant = illumination.constant;
-    let plus = |light: Channels| -> Channels { std::array::from_fn(|channel| light[channel] + constant[channel]) };
+    let plus =
+        |light: Channels| -> Channels { std::array::from_fn(|channel| light[channel] + constant[channel]) };
     let views = views.iter().zip(row);
     match (&illumination.columns, &illumination.rows, &illumination.full) {
         (None, None, None) => views.for_each(|(view, light)| *light = dot(view.gain, constant)),
         (Some(table), None, None) => {
-            views.for_each(|(view, light)| *light = dot(view.gain, plus(table.at(view.at[0]))));
+            views.for_each(|(view, light)| *light = dot(view.gain, plus(table.at(view.column))));
         }
         (None, Some(table), None) => {
-            views.for_each(|(view, light)| *light = dot(view.gain, plus(table.at(view.at[1]))));
+            views.for_each(|(view, light)| *light = dot(view.gain, plus(table.at(view.row))));
         }
-        _ => views.for_each(|(view, light)| *light = dot(view.gain, illumination.at(view.at[0], view.at[1]))),
+        _ => views.for_each(|(view, light)| {
+            let dark = view.gain == [0.0; 3];
+            *light = if dark { 0.0 } else { dot(view.gain, illumination.at(view.column, view.row)) };
+        }),
     }
 }
 
-/// Electrons and samples of single pixels.
+/// From light to samples.
 struct Developer {
     background_e: f32,
     full_well_e: f32,
@@ -236,19 +237,28 @@ impl Developer {
         }
     }
 
-    /// Sample in DN, rounded and clipped.
-    #[inline]
-    fn develop(&self, stream: Stream, pixel: u64, light_e: f32, pattern: Option<[f32; 2]>) -> f32 {
-        let [sensitivity, offset] = pattern.unwrap_or([1.0, 0.0]);
-        let mean = (light_e * sensitivity + self.background_e).max(0.0);
-        let mut electrons = stream.electrons(pixel, mean, self.full_well_e, self.read_noise_e) + offset;
-        if let Some((gamma, white_e)) = self.curve {
-            let share = electrons / white_e;
-            electrons = white_e * libm::powf(share.abs(), gamma).copysign(share);
+    /// Turns mean electrons of light into samples in DN, clipped but not yet cut to whole numbers.
+    fn develop(&self, stream: Stream, first_pixel: u64, row: &mut [f32], pattern: Option<&[[f32; 2]]>) {
+        match pattern {
+            None => row.iter_mut().for_each(|light| *light = (*light + self.background_e).max(0.0)),
+            Some(pattern) => row.iter_mut().zip(pattern).for_each(|(light, [sensitivity, _])| {
+                *light = (*light * sensitivity + self.background_e).max(0.0);
+            }),
         }
-        let dn = electrons * self.dn_per_electron + self.black_dn + 0.5;
-        // Truncation after adding 1/2 rounds; `as` would wrap nothing but saturate at the type's bounds only.
-        dn.clamp(0.0, self.full_scale_dn)
+        stream.expose(first_pixel, row, self.full_well_e, self.read_noise_e);
+        if let Some(pattern) = pattern {
+            row.iter_mut().zip(pattern).for_each(|(electrons, [_, offset])| *electrons += offset);
+        }
+        if let Some((gamma, white_e)) = self.curve {
+            for electrons in row.iter_mut() {
+                let share = *electrons / white_e;
+                *electrons = white_e * libm::powf(share.abs(), gamma).copysign(share);
+            }
+        }
+        for value in row {
+            // With the half, cutting off the fraction rounds.
+            *value = (*value * self.dn_per_electron + (self.black_dn + 0.5)).clamp(0.0, self.full_scale_dn);
+        }
     }
 }
 

@@ -8,14 +8,8 @@ use std::sync::{
 use thiserror::Error;
 
 use super::{
-    camera::SimCameras,
-    description::RigDescription,
-    panel::Panel,
-    projector::SimProjectors,
-    render::Renderer,
-    scene::Scene,
-    timeline::Timeline,
-    world::World,
+    camera::SimCameras, description::RigDescription, panel::Panel, projector::SimProjectors,
+    render::Renderer, scene::Scene, timeline::Timeline, world::World,
 };
 use crate::{camera::Region, clock::Clock, error::DeviceError};
 
@@ -29,16 +23,22 @@ pub enum RigError {
     #[error("the scene cannot be built: {}", .0.join("; "))]
     Scene(Vec<String>),
     /// A distortion that has no inverse within the picture.
-    #[error("the distortion of the simulated {which} folds over within its picture; reduce sim.{which}.k1 to k3")]
+    #[error(
+        "the distortion of the simulated {which} folds over within its picture; reduce sim.{which}.k1 to k3"
+    )]
     Lens {
         /// `camera` or `projector`.
         which: &'static str,
     },
     /// No turn of the projector meets the aim.
-    #[error("no pose of the projector aims its picture at the camera's axis; change sim.pose.aim_mm or give sim.pose.rotation")]
+    #[error(
+        "no pose of the projector aims its picture at the camera's axis; change sim.pose.aim_mm or give sim.pose.rotation"
+    )]
     Aim,
     /// An object with a level gets no light.
-    #[error("object `{object}` of the scene has a level, but no pixel sees it in the projector's light; move it or drop its level")]
+    #[error(
+        "object `{object}` of the scene has a level, but no pixel sees it in the projector's light; move it or drop its level"
+    )]
     Dark {
         /// Name in the scene.
         object: String,
@@ -224,12 +224,11 @@ impl Rig {
         };
         for y in rows {
             let start = (y + world.border) * world.width + world.border;
-            for view in &world.views[start + columns.start..start + columns.end.max(columns.start)] {
-                let [column, row] = if view.lit { view.at } else { [f32::NAN; 2] };
-                truth.column.push(column);
-                truth.row.push(row);
-                truth.depth_mm.push(view.depth_mm);
-                truth.object.push(view.face);
+            for sight in &world.sights[start + columns.start..start + columns.end.max(columns.start)] {
+                truth.column.push(sight.at[0]);
+                truth.row.push(sight.at[1]);
+                truth.depth_mm.push(sight.depth_mm);
+                truth.object.push(sight.face);
             }
         }
         truth

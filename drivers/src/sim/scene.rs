@@ -183,11 +183,15 @@ impl Scene {
         if !self.objects.is_empty()
             && !self.objects.iter().any(|object| object.level.is_some() && object.level_of.is_none())
         {
-            faults.add("objects", "need at least one with a level of its own, to set the projector's light by");
+            faults
+                .add("objects", "need at least one with a level of its own, to set the projector's light by");
         }
         let primitives: usize = self.objects.iter().map(|object| object.shape.faces()).sum();
         if primitives > MOST_PRIMITIVES {
-            faults.add("objects", &format!("have {primitives} faces, at most {MOST_PRIMITIVES} can be numbered"));
+            faults.add(
+                "objects",
+                &format!("have {primitives} faces, at most {MOST_PRIMITIVES} can be numbered"),
+            );
         }
         faults.into_list()
     }
@@ -365,7 +369,8 @@ impl Step {
         let edge = self.edge_x_mm;
         let facing = [0.0, 0.0, -1.0];
         let rise = [self.left_z_mm.min(self.right_z_mm), self.left_z_mm.max(self.right_z_mm)];
-        let face = |z, extent| Solid::plane([0.0, 0.0, z], facing, Clip::new(Some(extent), Some(self.y_mm), None));
+        let face =
+            |z, extent| Solid::plane([0.0, 0.0, z], facing, Clip::new(Some(extent), Some(self.y_mm), None));
         vec![
             ("-left".into(), face(self.left_z_mm, [left, edge]), 1.0),
             ("-right".into(), face(self.right_z_mm, [edge, right]), 1.0),

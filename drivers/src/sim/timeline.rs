@@ -187,3 +187,146 @@ fn without_negligible(mut weights: Mixture) -> Mixture {
     }
     weights
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::sim::testing::small_rig;
+    use proptest::prelude::*;
+
+    fn timeline(lcd_ms: f64, flicker: Option<FlickerDescription>) -> Timeline {
+        let mut description = small_rig();
+        description.projector.lcd_10_90_ms = lcd_ms;
+        description.projector.latency_refreshes = 2;
+        description.flicker = flicker;
+        Timeline::new(&description)
+    }
+
+    fn slide(number: u8) -> Arc<Slide> {
+        Arc::new(Slide::Uniform([number, 0, 0]))
+    }
+
+    fn weight(mixture: &Mixture, number: u8) -> f64 {
+        let of = Slide::Uniform([number, 0, 0]);
+        mixture.iter().filter(|(slide, _)| **slide == of).map(|(_, weight)| weight).sum()
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(40))]
+        /// Against the differential equation, solved in small steps.
+        #[test]
+        fn weights_agree_with_integration(
+            gaps in proptest::collection::vec(0u64..40_000_000, 1..5),
+            offset in 0u64..80_000_000, length in 100_000u64..30_000_000,
+            lcd_ms in 0.5f64..20.0, share in 0.0f64..0.5, hz in 20.0f64..200.0,
+        ) {
+            let mut timeline = timeline(lcd_ms, Some(FlickerDescription { share, hz }));
+            let (start, end) = (30_000_000 + offset, 30_000_000 + offset + length);
+            timeline.expect(0, Timestamp(start));
+            let mut now = 1_000_000;
+            let mut changes = vec![];
+            for (number, gap) in gaps.iter().enumerate() {
+                let (_, flipped) = timeline.flip(Timestamp(now), Some(slide(number as u8 + 1)));
+                changes.push((flipped.0 + timeline.latency_ns, number as u8 + 1));
+                now = flipped.0 + gap;
+            }
+            let ours = timeline.mixture(Timestamp(start), Timestamp(end));
+
+            let step_ns = 1_000u64;
+            let mut state = vec![0.0; gaps.len() + 1];
+            state[0] = 1.0;
+            let mut sums = vec![0.0; gaps.len() + 1];
+            let tau = lcd_ms * 1e-3 / 9f64.ln();
+            let fade = (-1e-9 * step_ns as f64 / tau).exp();
+            let mut time = 0;
+            while time < end {
+                let middle = time + step_ns / 2;
+                let current = changes.iter().rev().find(|(at, _)| *at <= middle).map_or(0, |(_, n)| *n) as usize;
+                let old = state.clone();
+                for (number, value) in state.iter_mut().enumerate() {
+                    let target = f64::from(u8::from(number == current));
+                    *value = target + (*value - target) * fade;
+                }
+                if middle >= start {
+                    let lamp = 1.0 + share * (std::f64::consts::TAU * hz * 1e-9 * middle as f64).sin();
+                    for (sum, (a, b)) in sums.iter_mut().zip(old.iter().zip(&state)) {
+                        *sum += 1e-9 * step_ns as f64 * lamp * 0.5 * (a + b);
+                    }
+                }
+                time += step_ns;
+            }
+            let seconds = 1e-9 * length as f64;
+            for (number, sum) in sums.iter().enumerate() {
+                // The steps are coarse at the ends and where the picture changes.
+                prop_assert!((weight(&ours, number as u8) - sum).abs() < 2e-3 * seconds + 3e-6, "{number}: {ours:?} {sums:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn the_residue_is_the_textbook_one() {
+        let mut timeline = timeline(6.0, None);
+        let (_, first) = timeline.flip(Timestamp(0), Some(slide(1)));
+        let (_, second) = timeline.flip(Timestamp(first.0 + 300_000_000), Some(slide(2)));
+        let light = second.0 + timeline.latency_ns;
+        let (delay, exposure) = (10e-3, 2e-3);
+        let start = Timestamp(light + (delay * 1e9) as u64);
+        let mixture = timeline.mixture(start, Timestamp(start.0 + 2_000_000));
+        let tau = 6e-3 / 9f64.ln();
+        let expected = tau * ((-delay / tau).exp() - (-(delay + exposure) / tau).exp());
+        assert!((weight(&mixture, 1) - expected).abs() < 1e-12);
+        assert!((weight(&mixture, 2) - (exposure - expected)).abs() < 1e-12);
+        // 10 % to 90 %: the time between the two shares is the one of the description.
+        let time_of = |share: f64| -tau * (1.0 - share).ln();
+        assert!((time_of(0.9) - time_of(0.1) - 6e-3).abs() < 1e-12);
+    }
+
+    #[test]
+    fn a_settled_picture_is_exact_and_so_is_one_that_is_shown_again() {
+        let mut timeline = timeline(6.0, None);
+        timeline.flip(Timestamp(0), Some(slide(1)));
+        let (_, flipped) = timeline.flip(Timestamp(100_000_000), Some(slide(2)));
+        let start = Timestamp(flipped.0 + 200_000_000);
+        let mixture = timeline.mixture(start, Timestamp(start.0 + 2_000_000));
+        assert_eq!(mixture.len(), 1);
+        assert!((mixture[0].1 - 2e-3).abs() < 1e-15);
+        let (_, flipped) = timeline.flip(Timestamp(start.0), Some(slide(2)));
+        let start = Timestamp(flipped.0 + timeline.latency_ns);
+        assert_eq!(timeline.mixture(start, Timestamp(start.0 + 2_000_000)).len(), 1);
+    }
+
+    #[test]
+    fn flips_come_at_refreshes_and_light_after_the_latency() {
+        let mut timeline = timeline(0.0, None);
+        let period = timeline.period_ns();
+        assert_eq!(period, 16_666_667);
+        assert_eq!(timeline.flip(Timestamp(0), Some(slide(1))), (1, Timestamp(period)));
+        assert_eq!(timeline.flip(Timestamp(period), Some(slide(2))), (2, Timestamp(2 * period)));
+        assert_eq!(timeline.flip(Timestamp(2 * period + 1), None).0, 3);
+        let light = |at: u64| timeline.mixture(Timestamp(at), Timestamp(at + 1000))[0].0.clone();
+        assert_eq!(*light(3 * period - 1000), Slide::Uniform([0; 3]));
+        assert_eq!(*light(3 * period), *slide(1));
+        assert_eq!(*light(4 * period), *slide(2));
+        assert_eq!(*light(5 * period), Slide::Uniform([0; 3]));
+    }
+
+    #[test]
+    fn the_past_is_forgotten_but_not_what_is_awaited() {
+        let mut timeline = timeline(6.0, None);
+        let mut now = 0;
+        for number in 0..200 {
+            now = timeline.flip(Timestamp(now), Some(slide(number))).1.0;
+        }
+        assert!(timeline.changes.len() < 20, "{}", timeline.changes.len());
+        timeline.expect(7, Timestamp(now));
+        let before = timeline.mixture(Timestamp(now), Timestamp(now + 2_000_000));
+        let mut later = now;
+        for number in 0..200 {
+            later = timeline.flip(Timestamp(later), Some(slide(number))).1.0;
+        }
+        assert_eq!(timeline.mixture(Timestamp(now), Timestamp(now + 2_000_000)), before);
+        timeline.dismiss(7);
+        timeline.flip(Timestamp(later), None);
+        assert!(timeline.changes.len() < 20);
+    }
+}

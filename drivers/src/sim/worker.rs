@@ -56,7 +56,9 @@ impl Worker {
             .spawn(move || run(&shared, &response, &incoming, &outgoing, &stop))
             .map_err(|error| DeviceError::Unavailable {
                 device: "sim-camera-0".to_owned(),
-                detail: format!("cannot start its thread: {error}; free memory or raise the limit of threads"),
+                detail: format!(
+                    "cannot start its thread: {error}; free memory or raise the limit of threads"
+                ),
             })?;
         Ok(Self { jobs: Some(jobs), frames, early: None, cancelled, thread: Some(thread) })
     }

@@ -8,7 +8,7 @@ use super::{
     description::{PanelPolarization, RigDescription, middle_px},
     noise,
     optics::{Pinhole, Placement},
-    panel::{Channels, Panel, reach_px},
+    panel::{Panel, reach_px},
     polarization::{Analyser, Ray, across},
     rig::RigError,
     scene::{Material, Scene},
@@ -20,24 +20,37 @@ pub(crate) const NO_OBJECT: u8 = 255;
 /// Distance at which light fields are of order 1, in mm.
 const UNIT_DISTANCE_MM: f64 = 1000.0;
 
-/// What one pixel sees.
+/// What one pixel sees: what frames are rendered from.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct View {
-    /// Projector coordinate, NaN where the projector cannot see the point.
-    pub(crate) at: [f32; 2],
     /// Electrons at the reference exposure and full drive, per channel.
-    pub(crate) gain: Channels,
+    pub(crate) gain: [f32; 3],
+    /// [`Panel::position`] of the column and the row; meaningless without gain.
+    pub(crate) column: u32,
+    pub(crate) row: u32,
+}
+
+/// What one pixel sees: what nobody but the rig knows.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Sight {
+    /// Projector coordinate, NaN where the point is not lit by the picture.
+    pub(crate) at: [f32; 2],
     /// z in mm, NaN where nothing is seen.
     pub(crate) depth_mm: f32,
     /// Number of the face.
     pub(crate) face: u8,
-    /// Whether the point lies within the projected picture and in its light.
-    pub(crate) lit: bool,
 }
 
 impl View {
-    const NOTHING: Self =
-        Self { at: [f32::NAN; 2], gain: [0.0; 4], depth_mm: f32::NAN, face: NO_OBJECT, lit: false };
+    const DARK: Self = Self { gain: [0.0; 3], column: 0, row: 0 };
+}
+
+impl Sight {
+    const NOTHING: Self = Self { at: [f32::NAN; 2], depth_mm: f32::NAN, face: NO_OBJECT };
+
+    fn is_lit(&self) -> bool {
+        self.at[0].is_finite()
+    }
 }
 
 /// All views of a sensor with a border around it.
@@ -51,6 +64,8 @@ pub(crate) struct World {
     pub(crate) border: usize,
     /// Row-major.
     pub(crate) views: Vec<View>,
+    /// Row-major.
+    pub(crate) sights: Vec<Sight>,
     /// Names of the faces, and whether they are planar.
     pub(crate) faces: Vec<(String, bool)>,
 }
@@ -109,18 +124,20 @@ impl World {
         let tracer = Tracer::new(description, scene, panel)?;
         let border = if description.camera.blur_px > 0.0 { reach_px(description.camera.blur_px) } else { 0 };
         let [width, height] = description.camera.size.map(|side| side as usize + 2 * border);
-        let mut views = vec![View::NOTHING; width * height];
-        views.par_chunks_mut(width).enumerate().try_for_each(|(y, row)| {
-            for (x, view) in row.iter_mut().enumerate() {
+        let mut views = vec![View::DARK; width * height];
+        let mut sights = vec![Sight::NOTHING; width * height];
+        let rows = views.par_chunks_mut(width).zip(sights.par_chunks_mut(width));
+        rows.enumerate().try_for_each(|(y, (views, sights))| {
+            for (x, (view, sight)) in views.iter_mut().zip(sights).enumerate() {
                 let pixel = [x as f64 - border as f64, y as f64 - border as f64];
                 let ray = tracer.camera.ray(pixel).ok_or(RigError::Lens { which: "camera" })?;
-                *view = tracer.view(ray);
+                (*view, *sight) = tracer.look(ray);
             }
             Ok(())
         })?;
         let faces =
             tracer.primitives.iter().map(|face| (face.name.clone(), face.shape.is_planar())).collect();
-        let mut world = Self { width, height, border, views, faces };
+        let mut world = Self { width, height, border, views, sights, faces };
         world.set_levels(description, scene, &tracer)?;
         Ok(world)
     }
@@ -155,13 +172,10 @@ impl World {
             }
         }
         let light = light.unwrap_or(1.0);
-        let per_face: Vec<f32> = tracer
-            .primitives
-            .iter()
-            .map(|face| (factors[face.object].unwrap_or(light)) as f32)
-            .collect();
-        self.views.par_iter_mut().for_each(|view| {
-            if let Some(factor) = per_face.get(usize::from(view.face)) {
+        let per_face: Vec<f32> =
+            tracer.primitives.iter().map(|face| (factors[face.object].unwrap_or(light)) as f32).collect();
+        self.views.par_iter_mut().zip(&self.sights).for_each(|(view, sight)| {
+            if let Some(factor) = per_face.get(usize::from(sight.face)) {
                 view.gain.iter_mut().for_each(|gain| *gain *= factor);
             }
         });
@@ -180,9 +194,10 @@ impl World {
         rows.into_par_iter()
             .map(|y| {
                 let mut brightest = vec![0.0f64; objects];
-                for view in &self.views[y * self.width + self.border..(y + 1) * self.width - self.border] {
-                    if view.lit {
-                        let object = tracer.primitives[usize::from(view.face)].object;
+                let row = y * self.width + self.border..(y + 1) * self.width - self.border;
+                for (view, sight) in self.views[row.clone()].iter().zip(&self.sights[row]) {
+                    if sight.is_lit() {
+                        let object = tracer.primitives[usize::from(sight.face)].object;
                         let seen: f64 =
                             drive.iter().zip(view.gain).map(|(drive, gain)| drive * f64::from(gain)).sum();
                         brightest[object] = brightest[object].max(seen);
@@ -190,10 +205,7 @@ impl World {
                 }
                 brightest
             })
-            .reduce(
-                || vec![0.0; objects],
-                |a, b| a.iter().zip(b).map(|(a, b)| a.max(b)).collect(),
-            )
+            .reduce(|| vec![0.0; objects], |a, b| a.iter().zip(b).map(|(a, b)| a.max(b)).collect())
     }
 }
 
@@ -213,8 +225,7 @@ impl<'a> Tracer<'a> {
             };
             (projector.response[channel], signed)
         });
-        let materials =
-            scene.objects.iter().map(|object| &scene.materials[&object.material]).collect();
+        let materials = scene.objects.iter().map(|object| &scene.materials[&object.material]).collect();
         Ok(Self {
             camera: camera_lens(description),
             projector: projector_lens(description),
@@ -231,12 +242,12 @@ impl<'a> Tracer<'a> {
     }
 
     /// What is seen along a ray of the camera.
-    fn view(&self, ray: Vector3<f64>) -> View {
+    fn look(&self, ray: Vector3<f64>) -> (View, Sight) {
         let Some((face, distance)) = nearest(&self.primitives, Vector3::zeros(), ray) else {
-            return View::NOTHING;
+            return (View::DARK, Sight::NOTHING);
         };
         let point = ray * distance;
-        let dark = View { depth_mm: point.z as f32, face: face as u8, ..View::NOTHING };
+        let dark = (View::DARK, Sight { depth_mm: point.z as f32, face: face as u8, ..Sight::NOTHING });
         let primitive = &self.primitives[face];
         let normal = primitive.shape.normal_against(point, ray);
         let to_light = (self.placement.centre_mm - point).normalize();
@@ -252,20 +263,21 @@ impl<'a> Tracer<'a> {
             return dark;
         }
         // Each pixel of the panel sends the same flux, so that a screen parallel to the panel is evenly lit.
-        let irradiance =
-            UNIT_DISTANCE_MM * UNIT_DISTANCE_MM / (in_projector.normalize().z * in_projector.z * in_projector.z);
+        let irradiance = UNIT_DISTANCE_MM * UNIT_DISTANCE_MM
+            / (in_projector.normalize().z * in_projector.z * in_projector.z);
         let material = self.materials[primitive.object];
         let natural_and_polarized = self.reflect(material, normal, to_light, -ray);
         let grain = 1.0 - material.texture * self.texture(material, primitive, point);
         let strength = irradiance * primitive.reflectance * grain;
-        let mut gain = [0.0f32; 4];
-        for channel in 0..3 {
+        let gain = std::array::from_fn(|channel| {
             let (light, degree) = self.channels[channel];
             let seen = natural_and_polarized[0] + degree * natural_and_polarized[1];
-            gain[channel] = (strength * light * material.tint[channel] * coverage[channel] * seen) as f32;
-        }
-        let lit = (0..2).all(|axis| at[axis] >= -0.5 && at[axis] < self.size[axis] - 0.5);
-        View { at: at.map(|value| value as f32), gain, lit, ..dark }
+            (strength * light * material.tint[channel] * coverage[channel] * seen) as f32
+        });
+        let within = (0..2).all(|axis| at[axis] >= -0.5 && at[axis] < self.size[axis] - 0.5);
+        let [column, row] = [0, 1].map(|axis| self.panel.position(axis, at[axis]));
+        let at = if within { at.map(|value| value as f32) } else { [f32::NAN; 2] };
+        (View { gain, column, row }, Sight { at, ..dark.1 })
     }
 
     fn texture(&self, material: &Material, primitive: &Primitive, point: Vector3<f64>) -> f64 {
@@ -297,5 +309,168 @@ impl<'a> Tracer<'a> {
             }
         }
         seen
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::sim::{scene::Scene, testing};
+
+    fn config(name: &str) -> toml::Table {
+        let path = format!("{}/../config/{name}", env!("CARGO_MANIFEST_DIR"));
+        std::fs::read_to_string(path).unwrap().parse().unwrap()
+    }
+
+    fn numbers(value: &toml::Value) -> Vec<f64> {
+        match value {
+            toml::Value::Array(values) => values.iter().flat_map(numbers).collect(),
+            value => vec![value.as_float().or(value.as_integer().map(|v| v as f64)).unwrap()],
+        }
+    }
+
+    /// OpenCV's projection, written out: x = X / Z, then distortion k1 k2 p1 p2 k3, then the matrix.
+    fn opencv(device: &toml::Value, [x, y, z]: [f64; 3]) -> [f64; 2] {
+        let (m, d) = (numbers(&device["matrix"]), numbers(&device["distortion"]));
+        let (x, y) = (x / z, y / z);
+        let r2 = x * x + y * y;
+        let radial = 1.0 + d[0] * r2 + d[1] * r2.powi(2) + d[4] * r2.powi(3);
+        let xd = x * radial + 2.0 * d[2] * x * y + d[3] * (r2 + 2.0 * x * x);
+        let yd = y * radial + d[2] * (r2 + 2.0 * y * y) + 2.0 * d[3] * x * y;
+        [m[0] * xd + m[2], m[4] * yd + m[5]]
+    }
+
+    #[test]
+    fn the_calibration_file_of_the_paper_rig_is_true() {
+        let description: RigDescription = config("sim.toml")["sim"].clone().try_into().unwrap();
+        let file = config("sim-calibration.toml");
+        let rotation = numbers(&file["transform"]["rotation"]);
+        let translation = numbers(&file["transform"]["translation_mm"]);
+        let (camera, projector) = (camera_lens(&description), projector_lens(&description));
+        let placement = placement(&description).unwrap();
+        for number in 0..2000u64 {
+            let random = |axis: u64| noise::mix(3 * number + axis) as f64 / u64::MAX as f64;
+            let point =
+                Vector3::new(400.0 * random(0) - 200.0, 300.0 * random(1) - 150.0, 800.0 + 400.0 * random(2));
+            let ours = camera.project(point).unwrap();
+            let theirs = opencv(&file["camera"], point.into());
+            let in_projector: [f64; 3] = std::array::from_fn(|row| {
+                (0..3).map(|axis| rotation[3 * row + axis] * point[axis]).sum::<f64>() + translation[row]
+            });
+            let lit = projector.project(placement.transform(point)).unwrap();
+            let expected = opencv(&file["projector"], in_projector);
+            for axis in 0..2 {
+                assert!((ours[axis] - theirs[axis]).abs() < 1e-6);
+                assert!((lit[axis] - expected[axis]).abs() < 1e-6, "{point}: {lit:?} {expected:?}");
+            }
+        }
+        let size = |device: &str| numbers(&file[device]["size"]);
+        assert_eq!(size("camera"), description.camera.size.map(f64::from));
+        assert_eq!(size("projector"), description.projector.size.map(f64::from));
+    }
+
+    /// Truth of one pixel the slow way: march along the ray until a surface is crossed, and from there to the light.
+    struct Oracle<'a> {
+        description: &'a RigDescription,
+        /// Height above the surface of each object, positive on the camera's side.
+        surfaces: &'a [fn([f64; 3]) -> Option<f64>],
+    }
+
+    impl Oracle<'_> {
+        /// Which surface a straight line crosses first, and where (share of the way).
+        fn crossing(&self, from: [f64; 3], to: [f64; 3], steps: u32) -> Option<(usize, [f64; 3])> {
+            let at =
+                |t: f64| -> [f64; 3] { std::array::from_fn(|axis| from[axis] + t * (to[axis] - from[axis])) };
+            for step in 0..steps {
+                let (a, b) = (f64::from(step) / f64::from(steps), f64::from(step + 1) / f64::from(steps));
+                for (number, height) in self.surfaces.iter().enumerate() {
+                    let side = |t| height(at(t));
+                    if let (Some(before), Some(after)) = (side(a), side(b))
+                        && before * after < 0.0
+                    {
+                        let (mut low, mut high) = (a, b);
+                        for _ in 0..60 {
+                            let middle = 0.5 * (low + high);
+                            let same = side(middle).is_some_and(|value| value * before > 0.0);
+                            if same { low = middle } else { high = middle }
+                        }
+                        return Some((number, at(low)));
+                    }
+                }
+            }
+            None
+        }
+
+        /// (object, z, lit) for a pixel of a camera without distortion.
+        fn truth(&self, x: f64, y: f64) -> Option<(usize, f64, bool)> {
+            let camera = &self.description.camera;
+            let [cx, cy] = middle_px(camera.size);
+            let far = 1500.0;
+            let end = [(x - cx) / camera.focal_px * far, (y - cy) / camera.focal_px * far, far];
+            let (object, point) = self.crossing([0.0, 0.0, 500.0].map(|z| z / far * 0.0), end, 30_000)?;
+            // Start a little above the surface.
+            let light = [52.4, 0.0, 0.0];
+            let start: [f64; 3] =
+                std::array::from_fn(|axis| point[axis] + 1e-4 * (light[axis] - point[axis]));
+            Some((object, point[2], self.crossing(start, light, 30_000).is_none()))
+        }
+    }
+
+    #[test]
+    fn truth_agrees_with_marching_along_rays() {
+        let scene: Scene = toml::from_str(
+            r#"
+            [materials.plaster]
+            diffuse = 0.8
+            [[objects]]
+            name = "wall"
+            material = "plaster"
+            level = 0.5
+            shape = { plane = { point_mm = [0.0, 0.0, 1050.0], normal = [0.1, 0.02, -1.0] } }
+            [[objects]]
+            name = "plate"
+            material = "plaster"
+            shape = { plane = { point_mm = [0.0, 0.0, 900.0], normal = [-0.1, 0.05, -1.0], x_mm = [-120.0, -30.0], y_mm = [-80.0, 60.0] } }
+            [[objects]]
+            name = "ball"
+            material = "plaster"
+            shape = { sphere = { centre_mm = [60.0, 10.0, 950.0], radius_mm = 50.0 } }
+            "#,
+        )
+        .unwrap();
+        let description = testing::small_rig();
+        let panel = Panel::new(&description.projector);
+        let world = World::new(&description, &scene, &panel).unwrap();
+        let surfaces: [fn([f64; 3]) -> Option<f64>; 3] = [
+            |[x, y, z]| Some(0.1 * x + 0.02 * y - (z - 1050.0)),
+            |[x, y, z]| {
+                ((-120.0..=-30.0).contains(&x) && (-80.0..=60.0).contains(&y))
+                    .then_some(-0.1 * x + 0.05 * y - (z - 900.0))
+            },
+            |[x, y, z]| Some(((x - 60.0).powi(2) + (y - 10.0).powi(2) + (z - 950.0).powi(2)).sqrt() - 50.0),
+        ];
+        let oracle = Oracle { description: &description, surfaces: &surfaces };
+        let (mut shadows, mut compared, mut differing) = (0, 0, 0);
+        for y in (0..240).step_by(7) {
+            for x in (0..320).step_by(5) {
+                let sight = world.sights[y * world.width + x];
+                let (object, depth, lit) = oracle.truth(x as f64, y as f64).unwrap();
+                compared += 1;
+                shadows += u32::from(!lit);
+                let agree = usize::from(sight.face) == object
+                    && (f64::from(sight.depth_mm) - depth).abs() < 1e-3
+                    && sight.is_lit() == lit;
+                // Steps of 0.05 mm may jump over a grazed rim.
+                differing += u32::from(!agree);
+                if agree && lit {
+                    let position = world.views[y * world.width + x].column;
+                    let u = f64::from(position) / f64::from(64 << 11);
+                    // The table starts some whole pixels before the panel.
+                    assert!(((u - f64::from(sight.at[0])).fract().abs() - 0.5).abs() > 0.499);
+                }
+            }
+        }
+        assert!(shadows > 30, "{shadows}");
+        assert!(differing * 200 < compared, "{differing} of {compared}");
     }
 }

@@ -24,7 +24,7 @@ impl Calibration {
             line(&format!("\n[{name}]"));
             line(&format!("size = [{}, {}]", lens.width, lens.height));
             line(&format!("matrix = {}", matrix(&lens.matrix())));
-            line(&format!("distortion = {:?}", lens.distortion));
+            line(&format!("distortion = {}", list(&lens.distortion)));
         };
         lens("camera", &self.camera);
         if let Some(projector) = &self.projector {
@@ -38,7 +38,7 @@ impl Calibration {
             if let Some(pose) = pose {
                 line(&format!("\n[{name}]"));
                 line(&format!("rotation = {}", matrix(&pose.rotation)));
-                line(&format!("translation_mm = {:?}", <[f64; 3]>::from(pose.translation_mm)));
+                line(&format!("translation_mm = {}", list(pose.translation_mm.as_slice())));
             }
         }
         out.push_str(&quality(&self.quality));
@@ -55,9 +55,18 @@ impl Calibration {
     }
 }
 
+/// Shortest decimal that reads back as the same number.
+fn float(value: f64) -> String {
+    if value.is_nan() { "nan".to_owned() } else { format!("{value:?}") }
+}
+
+fn list(values: &[f64]) -> String {
+    format!("[{}]", values.iter().map(|v| float(*v)).collect::<Vec<_>>().join(", "))
+}
+
 fn matrix(m: &Matrix3<f64>) -> String {
-    let row = |r: usize| format!("[{:?}, {:?}, {:?}]", m[(r, 0)], m[(r, 1)], m[(r, 2)]);
-    format!("[{}, {}, {}]", row(0), row(1), row(2))
+    let rows: Vec<String> = m.row_iter().map(|row| list(&[row[0], row[1], row[2]])).collect();
+    format!("[{}]", rows.join(", "))
 }
 
 fn quality(quality: &Quality) -> String {
@@ -71,8 +80,8 @@ fn quality(quality: &Quality) -> String {
         }
     };
     let text = |t: &String| Value::String(t.clone()).to_string();
-    entry("camera_rms_px", quality.camera_rms_px.map(|v| format!("{v:?}")));
-    entry("projector_rms_px", quality.projector_rms_px.map(|v| format!("{v:?}")));
+    entry("camera_rms_px", quality.camera_rms_px.map(float));
+    entry("projector_rms_px", quality.projector_rms_px.map(float));
     entry("views", quality.views.map(|v| v.to_string()));
     entry("date", quality.date.as_ref().map(text));
     entry("method", quality.method.as_ref().map(text));

@@ -159,3 +159,6 @@ fn recognise(bytes: &[u8], name: &str) -> Option<Format> {
         _ => None,
     }
 }
+
+#[cfg(test)]
+mod tests;

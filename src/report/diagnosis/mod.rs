@@ -3,6 +3,7 @@
 //! Every threshold is in units of noise or a share of something, and says where it comes from. A sound scan has no
 //! reason at all; what is merely worth knowing is a note of the report.
 
+mod captured;
 mod field;
 mod order;
 mod pairs;
@@ -54,11 +55,17 @@ pub enum Diagnosis {
     SensorDefect,
     /// Few of the lit pixels gave a measurement.
     LowCoverage,
+    /// A device failed, or did not end as it should.
+    DeviceFault,
+    /// Part of the proof that frames and pictures belong together is missing.
+    CaptureUnproven,
+    /// The capture was cancelled.
+    Cancelled,
 }
 
 impl Diagnosis {
     /// All of them, in the order of the documentation.
-    pub const ALL: [Self; 17] = [
+    pub const ALL: [Self; 20] = [
         Self::StaleFrame,
         Self::LostFrame,
         Self::TornFrame,
@@ -76,6 +83,9 @@ impl Diagnosis {
         Self::RowMismatch,
         Self::SensorDefect,
         Self::LowCoverage,
+        Self::DeviceFault,
+        Self::CaptureUnproven,
+        Self::Cancelled,
     ];
 
     /// Its name in files.
@@ -98,6 +108,9 @@ impl Diagnosis {
             Self::RowMismatch => "row-mismatch",
             Self::SensorDefect => "sensor-defect",
             Self::LowCoverage => "low-coverage",
+            Self::DeviceFault => "device-fault",
+            Self::CaptureUnproven => "capture-unproven",
+            Self::Cancelled => "cancelled",
         }
     }
 

@@ -78,6 +78,14 @@ impl Place {
         }
     }
 
+    /// As [`Place::claim`] for an empty folder that no rename can replace.
+    #[cfg(test)]
+    pub(super) fn claim_inside(disk: &dyn Disk, out: &Path) -> Result<Self, StorageError> {
+        let target = Target::find(out)?;
+        let (partial, inside, marker) = target.claim_inner(disk)?;
+        Ok(Self { target: target.path, partial, inside, made: Vec::new(), _marker: marker })
+    }
+
     /// Gives the finished folder its name, on the medium.
     pub(super) fn publish(&mut self, disk: &dyn Disk) -> Result<(), StorageError> {
         let marker = self.partial.join(MARKER);
@@ -129,8 +137,8 @@ impl Place {
     }
 }
 
-/// Removes what already bears its final name; the manifest moved last and goes first, so that a half removed bundle is
-/// none.
+/// Removes what already bears its final name, the last first: the manifest moved last, and without it what is left is
+/// no bundle.
 fn take_back(paths: &[PathBuf]) {
     for path in paths.iter().rev() {
         let removed = if path.is_dir() { fs::remove_dir_all(path) } else { fs::remove_file(path) };
@@ -222,15 +230,8 @@ impl Target {
 
     /// Makes the folder to write to: beside the target, or in it where a rename could not replace the target.
     fn claim_partial(&self, disk: &dyn Disk) -> Result<(PathBuf, bool, File), StorageError> {
-        let inner = || {
-            let partial = self.path.join(INNER);
-            self.try_claim(disk, &partial)?.map(|marker| (partial.clone(), true, marker)).ok_or_else(|| {
-                let found = format!("it holds {INNER}, which is not an unfinished bundle");
-                StorageError::Occupied { path: self.path.clone(), found }
-            })
-        };
         if self.exists && must_stay(&self.path) {
-            return inner();
+            return self.claim_inner(disk);
         }
         let name = self.path.file_name().unwrap_or_default();
         let parent = self.path.parent().unwrap_or(Path::new("/"));
@@ -252,13 +253,24 @@ impl Target {
                             io::ErrorKind::PermissionDenied | io::ErrorKind::ReadOnlyFilesystem
                         ) =>
                 {
-                    return inner();
+                    return self.claim_inner(disk);
                 }
                 Err(error) => return Err(error),
             }
         }
         let found = "all names for the unfinished bundle beside it are taken".to_owned();
         Err(StorageError::Occupied { path: self.path.clone(), found })
+    }
+
+    fn claim_inner(&self, disk: &dyn Disk) -> Result<(PathBuf, bool, File), StorageError> {
+        let partial = self.path.join(INNER);
+        match self.try_claim(disk, &partial)? {
+            Some(marker) => Ok((partial, true, marker)),
+            None => {
+                let found = format!("it holds {INNER}, which is not an unfinished bundle");
+                Err(StorageError::Occupied { path: self.path.clone(), found })
+            }
+        }
     }
 
     /// Makes and marks `partial`, in place of what a dead process left there. `None` if it is somebody else's.
@@ -291,7 +303,7 @@ impl Target {
 }
 
 /// Whether renaming another folder to `path` would fail or pull it away from under somebody.
-fn must_stay(path: &Path) -> bool {
+pub(super) fn must_stay(path: &Path) -> bool {
     let is_mount = rustix::fs::statx(
         rustix::fs::CWD,
         path,

@@ -216,6 +216,10 @@ impl Manifest {
                     faults.push(Fault::new(format!("processing.regions[{index}]"), "is empty"));
                 }
             }
+            if !(processing.row_gate_px.is_finite() && processing.row_gate_px > 0.0) {
+                let message = format!("is {} px, expected a positive number", processing.row_gate_px);
+                faults.push(Fault::new("processing.row_gate_px", message));
+            }
             let gates = processing.thresholds;
             for (key, gate) in [
                 ("lit_sigma", gates.lit_sigma),

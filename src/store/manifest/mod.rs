@@ -17,7 +17,9 @@ use polscan_patterns::{Axis, Mode, Polarization, ProjectorSize, Role, Sequence};
 use serde::{Deserialize, Serialize};
 
 use crate::{
+    cloud::DEFAULT_ROW_GATE_PX,
     decode::{DecodeSettings, Thresholds},
+    report::NamedRegion,
     sequencer::{CaptureRecord, Retake},
     truth::TruthObject,
 };
@@ -192,7 +194,7 @@ pub struct Settings {
 }
 
 /// Everything outside frames, code, camera and calibration that fixes the maps.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Processing {
     /// Gates of the decoder.
@@ -203,9 +205,19 @@ pub struct Processing {
     /// Named regions that planes are fitted to.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub regions: Vec<NamedRegion>,
-    /// Settings of the reconstruction, as its own type writes them.
-    #[serde(skip_serializing_if = "serde_json::Value::is_null")]
-    pub reconstruction: serde_json::Value,
+    /// Largest distance of a measured row from the predicted one, in projector px.
+    pub row_gate_px: f64,
+}
+
+impl Default for Processing {
+    fn default() -> Self {
+        Self {
+            thresholds: Thresholds::default(),
+            volume: None,
+            row_gate_px: DEFAULT_ROW_GATE_PX,
+            regions: Vec::new(),
+        }
+    }
 }
 
 /// Depths that a point can have, z in the camera frame.
@@ -216,22 +228,6 @@ pub struct Volume {
     pub near_mm: f64,
     /// Greatest depth in mm.
     pub far_mm: f64,
-}
-
-/// A named rectangle of the image in pixels.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct NamedRegion {
-    /// Name in the report.
-    pub name: String,
-    /// First column.
-    pub x: u32,
-    /// First row.
-    pub y: u32,
-    /// Columns.
-    pub width: u32,
-    /// Rows.
-    pub height: u32,
 }
 
 /// How the capture went.

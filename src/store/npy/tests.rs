@@ -25,7 +25,9 @@ fn with_header(version: u8, text: &str) -> Vec<u8> {
 fn the_header_is_the_one_that_numpy_writes() {
     // As numpy.save writes numpy.zeros((44, 1200, 1600), numpy.uint16).
     let bytes = Header::to_bytes(Dtype::U16, &[44, 1200, 1600]);
-    let mut expected = b"\x93NUMPY\x01\x00\x76\x00{'descr': '<u2', 'fortran_order': False, 'shape': (44, 1200, 1600), }".to_vec();
+    let mut expected =
+        b"\x93NUMPY\x01\x00\x76\x00{'descr': '<u2', 'fortran_order': False, 'shape': (44, 1200, 1600), }"
+            .to_vec();
     expected.resize(127, b' ');
     expected.push(b'\n');
     assert_eq!(bytes, expected);
@@ -61,7 +63,8 @@ fn what_cannot_be_read_says_why() {
         let error = Header::parse(&bytes).unwrap_err();
         assert!(error.contains(part), "{error}");
     }
-    let vast = with_header(1, "{'descr': '<u2', 'fortran_order': False, 'shape': (4294967296, 4294967296, 2), }");
+    let vast =
+        with_header(1, "{'descr': '<u2', 'fortran_order': False, 'shape': (4294967296, 4294967296, 2), }");
     assert_eq!(Header::parse(&vast).unwrap().data_bytes(), None);
 }
 

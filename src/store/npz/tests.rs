@@ -6,7 +6,11 @@ use super::*;
 
 fn archive(floats: &Grid<f32>, bytes: &Grid<u8>, flags: &Grid<bool>) -> Vec<u8> {
     let mut out = Vec::new();
-    write(&mut out, &[("depth", Array::F32(floats)), ("class", Array::U8(bytes)), ("mask", Array::Bool(flags))]).unwrap();
+    write(
+        &mut out,
+        &[("depth", Array::F32(floats)), ("class", Array::U8(bytes)), ("mask", Array::Bool(flags))],
+    )
+    .unwrap();
     out
 }
 

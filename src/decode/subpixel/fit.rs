@@ -1,0 +1,256 @@
+//! Local fits of the projector coordinate through the edges of one surface.
+
+use std::ops::Range;
+
+use super::edges::Edge;
+
+/// A depth jump: the lines of both sides disagree between two edges by more than this many projector px ...
+const MIN_JUMP: f64 = 0.6;
+/// ... and by more than this many sigma.
+const JUMP_SIGMA: f64 = 6.0;
+/// Edges on each side that a jump is looked for with.
+const JUMP_EDGES: usize = 3;
+/// A fit is refused where its chi-square is this many standard deviations too large.
+const MISFIT: f64 = 2.5;
+/// A parabola takes this many times the edges of a line.
+const WIDE: usize = 2;
+/// Gain in chi-square that makes a parabola out of a line.
+const BEND_CHI2: f64 = 4.0;
+/// Edges of the line that is left where not even a parabola fits.
+const SHORT: usize = 4;
+
+/// `u(x) = c0 + c1 t + c2 t^2`, `t = x - origin`, with the covariance of the coefficients.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Fit {
+    origin: f64,
+    coefficients: [f64; 3],
+    /// Upper triangle by rows: 00 01 02 11 12 22.
+    covariance: [f64; 6],
+}
+
+impl Fit {
+    /// Coordinate and its variance at a position.
+    pub fn at(&self, position: f64) -> (f64, f64) {
+        let t = position - self.origin;
+        let [c0, c1, c2] = self.coefficients;
+        let [v00, v01, v02, v11, v12, v22] = self.covariance;
+        let variance = v00 + t * (2.0 * v01 + t * (v11 + 2.0 * v02 + t * (2.0 * v12 + t * v22)));
+        (c0 + t * (c1 + t * c2), variance)
+    }
+}
+
+/// Weighted sums of edges about an origin.
+struct Sums {
+    origin: f64,
+    base: f64,
+    /// Sums of w t^i.
+    t: [f64; 5],
+    /// Sums of w t^i u.
+    u: [f64; 3],
+}
+
+impl Sums {
+    fn of(edges: &[Edge]) -> Self {
+        let (origin, base) = (edges[edges.len() / 2].position, edges[edges.len() / 2].u);
+        let mut sums = Self { origin, base, t: [0.0; 5], u: [0.0; 3] };
+        for edge in edges {
+            let (t, u, w) = (edge.position - origin, edge.u - base, 1.0 / edge.variance);
+            let tt = t * t;
+            for (sum, power) in sums.t.iter_mut().zip([1.0, t, tt, tt * t, tt * tt]) {
+                *sum += w * power;
+            }
+            for (sum, power) in sums.u.iter_mut().zip([1.0, t, tt]) {
+                *sum += w * power * u;
+            }
+        }
+        sums
+    }
+
+    /// Straight line: coefficients and covariance for weights that are 1/variance of u.
+    fn line(&self) -> Option<Fit> {
+        let [s0, s1, s2, ..] = self.t;
+        let determinant = s0 * s2 - s1 * s1;
+        (determinant > 1e-12 * s0 * s2).then(|| {
+            let slope = (s0 * self.u[1] - s1 * self.u[0]) / determinant;
+            let level = (s2 * self.u[0] - s1 * self.u[1]) / determinant;
+            let covariance = [s2 / determinant, -s1 / determinant, 0.0, s0 / determinant, 0.0, 0.0];
+            Fit { origin: self.origin, coefficients: [self.base + level, slope, 0.0], covariance }
+        })
+    }
+
+    /// Parabola, by the inverse of the symmetric 3x3 normal matrix.
+    fn parabola(&self) -> Option<Fit> {
+        let [s0, s1, s2, s3, s4] = self.t;
+        let (m00, m01, m02) = (s2 * s4 - s3 * s3, s2 * s3 - s1 * s4, s1 * s3 - s2 * s2);
+        let (m11, m12, m22) = (s0 * s4 - s2 * s2, s1 * s2 - s0 * s3, s0 * s2 - s1 * s1);
+        let determinant = s0 * m00 + s1 * m01 + s2 * m02;
+        (determinant > 1e-12 * s0 * s2 * s4).then(|| {
+            let covariance = [m00, m01, m02, m11, m12, m22].map(|minor| minor / determinant);
+            let [i00, i01, i02, i11, i12, i22] = covariance;
+            let [u0, u1, u2] = self.u;
+            let coefficients = [
+                self.base + i00 * u0 + i01 * u1 + i02 * u2,
+                i01 * u0 + i11 * u1 + i12 * u2,
+                i02 * u0 + i12 * u1 + i22 * u2,
+            ];
+            Fit { origin: self.origin, coefficients, covariance }
+        })
+    }
+}
+
+/// Sets the scale of the covariance: edges are exact in u and noisy in x, which the slope turns into u. Returns the
+/// chi-square; where it is larger than its degrees of freedom the covariance grows with it.
+fn scale(fit: &mut Fit, edges: &[Edge], parameters: usize) -> f64 {
+    let middle = (edges[0].position + edges[edges.len() - 1].position) / 2.0 - fit.origin;
+    let slope = fit.coefficients[1] + 2.0 * fit.coefficients[2] * middle;
+    let per_slope = 1.0 / (slope * slope);
+    let chi2 = edges
+        .iter()
+        .map(|edge| {
+            let off = edge.u - fit.at(edge.position).0;
+            off * off * per_slope / edge.variance
+        })
+        .sum::<f64>();
+    let freedom = edges.len() - parameters;
+    let excess = if freedom > 0 { (chi2 / freedom as f64).max(1.0) } else { 1.0 };
+    for entry in &mut fit.covariance {
+        *entry *= slope * slope * excess;
+    }
+    chi2
+}
+
+fn fits_badly(chi2: f64, freedom: usize) -> bool {
+    let freedom = freedom as f64;
+    chi2 > freedom + MISFIT * (2.0 * freedom).sqrt()
+}
+
+/// Ranges of edges that models around an interval are fitted to.
+struct Windows {
+    /// Twice as many edges as the line takes.
+    wide: Range<usize>,
+    line: Range<usize>,
+    short: Range<usize>,
+}
+
+/// The best description of the edges around an interval. A parabola through twice as many edges is as precise as the
+/// line (its variance in the middle is 9/4 of that of a line through the same edges) and has no bias on curved
+/// surfaces, so it comes first where there are enough edges. Where its residuals exceed noise the window shrinks:
+/// line, parabola through the edges of the line, and where not even that fits, a short line.
+fn fit_windows(edges: &[Edge], windows: &Windows) -> Option<Fit> {
+    let wide = &edges[windows.wide.clone()];
+    let middle = &edges[windows.line.clone()];
+    if middle.len() < 2 {
+        return None;
+    }
+    if 4 * wide.len() >= 3 * WIDE * middle.len() && wide.len() > 4 {
+        let mut parabola = Sums::of(wide).parabola();
+        if let Some(fit) = &mut parabola
+            && !fits_badly(scale(fit, wide, 3), wide.len() - 3)
+        {
+            return parabola;
+        }
+    }
+    let sums = Sums::of(middle);
+    let mut line = sums.line()?;
+    let of_line = scale(&mut line, middle, 2);
+    if middle.len() > 4
+        && let Some(mut parabola) = sums.parabola()
+    {
+        let of_parabola = scale(&mut parabola, middle, 3);
+        let bends = of_line - of_parabola > BEND_CHI2 * (of_parabola / (middle.len() - 3) as f64).max(1.0);
+        match (fits_badly(of_line, middle.len() - 2), fits_badly(of_parabola, middle.len() - 3)) {
+            (false, _) if !bends => return Some(line),
+            (_, false) => return Some(parabola),
+            _ => {}
+        }
+    } else if middle.len() < 4 || !fits_badly(of_line, middle.len() - 2) {
+        return Some(line);
+    }
+    let near = &edges[windows.short.clone()];
+    let mut nearer = Sums::of(near).line().filter(|_| near.len() < middle.len());
+    if let Some(fit) = &mut nearer {
+        scale(fit, near, 2);
+    }
+    nearer.or(Some(line))
+}
+
+/// Edges of one run, split where the surface jumps.
+#[derive(Debug, Default)]
+pub(super) struct Segments {
+    /// Segment of each edge, as its range of edges.
+    of_edge: Vec<(usize, usize)>,
+    starts: Vec<usize>,
+}
+
+impl Segments {
+    /// Splits `edges` at jumps.
+    pub fn split(&mut self, edges: &[Edge]) {
+        self.starts.clear();
+        self.of_edge.clear();
+        let mut start = 0;
+        for next in 1..edges.len() {
+            if jumps(edges, start, next) {
+                self.starts.push(start);
+                start = next;
+            }
+        }
+        if !edges.is_empty() {
+            self.starts.push(start);
+        }
+        for (index, &start) in self.starts.iter().enumerate() {
+            let end = self.starts.get(index + 1).copied().unwrap_or(edges.len());
+            self.of_edge.extend((start..end).map(|_| (start, end)));
+        }
+    }
+
+    /// Fits for pixels after `passed` edges: one where both neighbouring edges belong to one segment, else one of
+    /// each side.
+    pub fn fits(&self, edges: &[Edge], passed: usize, fit_edges: usize) -> [Option<Fit>; 2] {
+        let before = passed.checked_sub(1).and_then(|edge| self.of_edge.get(edge)).copied();
+        let after = self.of_edge.get(passed).copied();
+        let fit = |(start, end): (usize, usize)| {
+            let of = |count| window(start, end, passed, count);
+            fit_windows(edges, &Windows { wide: of(WIDE * fit_edges), line: of(fit_edges), short: of(SHORT) })
+        };
+        match (before, after) {
+            (Some(before), Some(after)) if before == after => [fit(before), None],
+            _ => [before.and_then(fit), after.and_then(fit)],
+        }
+    }
+}
+
+/// Up to `count` edges of `start..end` around the interval before edge `passed`.
+fn window(start: usize, end: usize, passed: usize, count: usize) -> Range<usize> {
+    let first = passed.saturating_sub(count / 2).min(end.saturating_sub(count)).max(start);
+    first..(first + count).min(end)
+}
+
+/// Whether the surface jumps between edges `next - 1` and `next`: the lines through the edges of either side
+/// disagree in the middle.
+fn jumps(edges: &[Edge], start: usize, next: usize) -> bool {
+    let left = &edges[next.saturating_sub(JUMP_EDGES).max(start)..next];
+    let right = &edges[next..(next + JUMP_EDGES).min(edges.len())];
+    let middle = (edges[next - 1].position + edges[next].position) / 2.0;
+    let line = |side: &[Edge]| {
+        if side.len() < 2 {
+            return None;
+        }
+        let mut fit = Sums::of(side).line()?;
+        let slope = fit.coefficients[1];
+        for entry in &mut fit.covariance {
+            *entry *= slope * slope;
+        }
+        Some(fit)
+    };
+    let disagree = |one: (f64, f64), other: (f64, f64)| {
+        let off = (one.0 - other.0).abs();
+        off > MIN_JUMP && off > JUMP_SIGMA * (one.1 + other.1).sqrt()
+    };
+    match (line(left), line(right)) {
+        (Some(left), Some(right)) => disagree(left.at(middle), right.at(middle)),
+        // A single edge: the other side's line must meet it.
+        (Some(left), None) => disagree(left.at(edges[next].position), (edges[next].u, 0.0)),
+        (None, Some(right)) => disagree(right.at(edges[next - 1].position), (edges[next - 1].u, 0.0)),
+        (None, None) => false,
+    }
+}
