@@ -2,4 +2,4 @@
 
 mod captures;
 mod simulated;
-mod synth;
+pub(crate) mod synth;
