@@ -322,7 +322,7 @@ fn a_timeout_leaves_the_stream_usable() {
         };
         timed_out(&mut open);
         let shown = open.projector.show(1).unwrap();
-        let at = after(shown.flipped, 100.0);
+        let at = after(shown.flipped, 400.0);
         open.camera.trigger(at).unwrap();
         timed_out(&mut open);
         let frame = open.camera.next_frame(Duration::from_secs(20)).unwrap();
@@ -341,7 +341,8 @@ fn exposures_can_be_announced_before_the_next_flip() {
         let first = open.projector.show(2).unwrap();
         open.camera.trigger(first.flipped + slow + Duration::from_millis(13)).unwrap();
         let second = open.projector.show(3).unwrap();
-        assert_eq!(second.refresh.unwrap(), first.refresh.unwrap() + 1, "{}", open.name);
+        let later = second.refresh.unwrap() - first.refresh.unwrap();
+        assert!(later == 1 || later > 1 && open.name.contains("real time"), "{}", open.name);
         let pipelined = open.camera.next_frame(Duration::from_secs(20)).unwrap();
         drop(open);
         let mut open = subject.open().armed();
@@ -369,36 +370,41 @@ fn a_repeated_scan_gives_the_same_frames_on_a_fresh_rig_and_another_take_on_the_
     assert_eq!(scan(&replay), scan(&replay));
 }
 
-/// Shows and exposes on a given timeline of refreshes and ms, so that pictures overlap in the liquid crystals.
-fn timed_scan(subject: &Subject) -> Vec<(u64, Vec<u16>)> {
+/// Shows and exposes on a given timeline of refreshes and ms, so that pictures overlap in the liquid crystals. `None`
+/// where this machine was too busy to keep it.
+fn timed_scan(subject: &Subject) -> Option<Vec<(u64, Vec<u16>)>> {
     let mut open = subject.open().armed();
     let period = open.projector.info().refresh_period;
-    // The time of day must not matter: start at a refresh that is far enough away for both clocks.
-    let start = Timestamp(60 * period.as_nanos() as u64);
-    assert!(open.clock.now() < start);
+    // Wherever the clock stands: the time of day must not matter.
+    let refresh = open.clock.now().0 / period.as_nanos() as u64 + 6;
+    let start = Timestamp(refresh * period.as_nanos() as u64);
     let mut frames = vec![];
     for step in 0..6u32 {
-        let before = start + 4 * step * period + period / 2;
+        let before = start + 4 * step * period + period / 4;
         open.clock.sleep_until(before);
         let shown = open.projector.show(step % SLIDES as u32).unwrap();
-        assert!(shown.flipped.since(before) < period);
         // In the middle of the change.
         let at = after(shown.flipped, 16.0 + f64::from(step));
-        assert_eq!(open.camera.trigger(at).unwrap(), at);
+        let started = open.camera.trigger(at).unwrap();
+        if shown.flipped.since(before) > period || started != at {
+            return None;
+        }
         let frame = open.camera.next_frame(Duration::from_secs(20)).unwrap();
         frames.push((frame.stamp.exposure_start.0 - start.0, samples(&frame)));
     }
-    frames
+    Some(frames)
 }
 
 #[test]
 fn fast_and_real_time_frames_are_the_same_bit_by_bit() {
-    let fast = timed_scan(&simulated(Pacing::Fast));
-    let real = timed_scan(&simulated(Pacing::RealTime));
-    assert_eq!(fast, real);
-    let fast = timed_scan(&replayed(Arc::new(VirtualClock::default()), "fast"));
-    let real = timed_scan(&replayed(Arc::new(MonotonicClock::start()), "real"));
-    assert_eq!(fast, real);
+    let in_time = |subject: &dyn Fn() -> Subject| {
+        (0..20)
+            .find_map(|_| timed_scan(&subject()))
+            .expect("this machine keeps a timeline in one of 20 tries")
+    };
+    assert_eq!(in_time(&|| simulated(Pacing::Fast)), in_time(&|| simulated(Pacing::RealTime)));
+    let fast = in_time(&|| replayed(Arc::new(VirtualClock::default()), "fast"));
+    assert_eq!(fast, in_time(&|| replayed(Arc::new(MonotonicClock::start()), "real")));
 }
 
 #[test]
