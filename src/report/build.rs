@@ -1,12 +1,11 @@
 //! From results to the report. Pure.
 
-use nalgebra::Vector3;
 use polscan_patterns::Mode;
 
 use super::{
     CaptureSummary, NamedRegion, Reason,
     accuracy::{self, Measured},
-    diagnosis, plane,
+    diagnosis,
     region::{self, NOTHING},
     statistics,
     types::{
@@ -15,7 +14,7 @@ use super::{
     },
 };
 use crate::{
-    cloud::{Reconstruction, RowCheck},
+    cloud::{Reconstruction, RowCheck, fit_plane},
     decode::{Class, DecodeSettings, Decoded, PairResidual},
     geometry::Quality,
     grid::Grid,
@@ -175,11 +174,11 @@ fn count(decoded: &Decoded, class: &Grid<Class>) -> PixelCounts {
 }
 
 /// Points of the valid pixels that `belongs` picks.
-fn points(made: &Reconstruction, belongs: impl Fn(usize) -> bool) -> impl Iterator<Item = Vector3<f64>> {
+fn points(made: &Reconstruction, belongs: impl Fn(usize) -> bool) -> impl Iterator<Item = [f64; 3]> {
     let pixels = made.class.data().iter().zip(made.cloud.point_mm.data()).enumerate();
     pixels
         .filter(move |(index, (class, _))| class.is_valid() && belongs(*index))
-        .map(|(_, (_, point))| Vector3::from(point.map(f64::from)))
+        .map(|(_, (_, point))| point.map(f64::from))
         .filter(|point| point.iter().all(|value| value.is_finite()))
 }
 
@@ -210,7 +209,7 @@ fn objects(input: &ReportInput, measured: Measured, truth: &Truth, interior: &Gr
                 truth: Some(accuracy::accuracy(measured, truth, off_shadow)),
                 rmse_off_shadow_mm: input.reconstruction.and_then(|made| {
                     let points: Vec<_> = points(made, off_shadow).collect();
-                    plane::fit_plane(&points).map(|fit| fit.rmse_mm)
+                    fit_plane(&points).ok().map(|fit| fit.rmse_mm)
                 }),
                 ..plane_of(&object.name, input, measured, |index| clear.data()[index] == label, lit)
             }
@@ -241,13 +240,13 @@ fn plane_of(
         }
     }
     let points: Vec<_> = input.reconstruction.map(|made| points(made, inside).collect()).unwrap_or_default();
-    let fit = plane::fit_plane(&points);
+    let fit = fit_plane(&points).ok();
     PlaneReport {
         name: name.to_owned(),
         points: points.len() as u64,
         coverage: statistics::share(valid, lit_pixels),
         rmse_mm: fit.map(|fit| fit.rmse_mm),
-        bow_mm: fit.and_then(|fit| fit.bow_mm),
+        bow_mm: fit.map(|fit| fit.bow_mm),
         p95_mm: fit.map(|fit| fit.p95_mm),
         lit: lit_pixels,
         rmse_off_shadow_mm: None,
@@ -564,10 +563,10 @@ mod tests {
             .filter(|&(x, y)| made.class.at(x, y).is_valid())
             .map(|(x, y)| testing::point(&made, x, y))
             .collect();
-        let fit = plane::fit_plane(&oracle).unwrap();
+        let fit = fit_plane(&oracle).unwrap();
         assert_eq!(
             (plane.rmse_mm, plane.p95_mm, plane.bow_mm),
-            (Some(fit.rmse_mm), Some(fit.p95_mm), fit.bow_mm)
+            (Some(fit.rmse_mm), Some(fit.p95_mm), Some(fit.bow_mm))
         );
         assert!(fit.rmse_mm > 0.2, "{}", fit.rmse_mm);
         assert_eq!(plane.truth, None);

@@ -134,6 +134,7 @@ mod tests {
                 noise: None,
             },
             statistics: StreamStatistics { triggers: 7, frames: 5, failed: 1 },
+            notes: Default::default(),
         }
     }
 

@@ -6,7 +6,6 @@ mod capture;
 pub mod colormap;
 mod diagnosis;
 pub mod pictures;
-mod plane;
 mod region;
 mod statistics;
 mod summary;
@@ -18,7 +17,6 @@ pub use accuracy::Accuracy;
 pub use build::{ReportInput, build};
 pub use capture::CaptureSummary;
 pub use diagnosis::{Diagnosis, Reason, Verdict, verdict};
-pub use plane::{PlaneFit, fit_plane};
 pub use region::{NamedRegion, RegionError};
 pub use summary::{Outputs, summary};
 pub use types::{

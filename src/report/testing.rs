@@ -1,6 +1,5 @@
 //! A small sound decode for tests, to be spoilt in one way each.
 
-use nalgebra::Vector3;
 use polscan_patterns::{Axis, AxisCode, Mode, ProjectorSize};
 
 use super::{ReportInput, Size};
@@ -73,6 +72,7 @@ pub fn decoded(width: usize, height: usize) -> Decoded {
         noise_estimated: false,
         black_level_dn: 41.0,
         pairs: pairs.collect(),
+        boundaries: vec![],
         drift: Some(0.0),
         losses: vec![],
     }
@@ -121,6 +121,6 @@ pub fn input(decoded: &Decoded) -> ReportInput<'_> {
 }
 
 /// The point of a pixel.
-pub fn point(made: &Reconstruction, x: usize, y: usize) -> Vector3<f64> {
-    Vector3::from(made.cloud.point_mm.at(x, y).map(f64::from))
+pub fn point(made: &Reconstruction, x: usize, y: usize) -> [f64; 3] {
+    made.cloud.point_mm.at(x, y).map(f64::from)
 }

@@ -228,7 +228,7 @@ pub struct PlaneReport {
     pub points: u64,
     /// Valid share of the lit pixels. Lit by the truth for an object of a simulated scene, else by the decoder.
     pub coverage: Option<f64>,
-    /// Root mean square distance in mm; `null` with the two below without a calibration or without three points.
+    /// Root mean square distance in mm; `null` with the two below without a calibration, or without six points that span a plane.
     pub rmse_mm: Option<f64>,
     /// Peak to valley over the points of the quadratic that fits the distances best, in mm.
     pub bow_mm: Option<f64>,

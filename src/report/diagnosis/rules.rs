@@ -160,15 +160,34 @@ fn wrong_order(input: &ReportInput, decoded: &Decoded, pixels: &PixelCounts) -> 
         });
         return Some(Reason::failed(Diagnosis::SwappedFrames, message, evidence));
     }
-    let off = share(pixels.off_boundary, pixels.lit).filter(|&off| off > OFF_BOUNDARY)?;
+    let suspect: Vec<_> = decoded.boundaries.iter().filter(|check| check.is_suspect()).collect();
+    let off = share(pixels.off_boundary, pixels.lit).unwrap_or(0.0);
+    let seen = match suspect.first() {
+        Some(check) => format!(
+            "{} of {} stripe edges of pair {} bit {} lie where its pattern has none",
+            check.illegal,
+            check.illegal + check.legal,
+            check.axis,
+            check.bit,
+        ),
+        None if off > OFF_BOUNDARY => {
+            format!("on {:.0} % of the lit pixels stripe edges lie where their pattern has none", 100.0 * off)
+        }
+        None => return None,
+    };
+    let evidence = json!({
+        "off_boundary": off,
+        "pairs": suspect.iter().map(|check| json!({
+            "axis": check.axis, "bit": check.bit, "legal": check.legal, "illegal": check.illegal,
+        })).collect::<Vec<_>>(),
+    });
     Some(Reason::failed(
         Diagnosis::SwappedFrames,
         format!(
-            "on {:.0} % of the lit pixels stripe edges lie where their pattern has none; frames are in another order \
-             than their names say, or belong to another code: check sequence, code offset and code bits",
-            100.0 * off,
+            "{seen}; frames are in another order than their names say, or belong to another code: check sequence, code \
+             offset and code bits"
         ),
-        json!({ "off_boundary": off }),
+        evidence,
     ))
 }
 
@@ -378,6 +397,7 @@ mod tests {
 
     use super::*;
     use crate::{
+        decode::BoundaryCheck,
         report::{Report, Size, Verdict, build, testing},
         sequencer::Retake,
     };
@@ -533,6 +553,15 @@ mod tests {
         };
         assert_eq!(displaced(60), [(Diagnosis::SwappedFrames, FAILED)]);
         assert_eq!(displaced(20), []);
+        let crossings = |illegal: u64| {
+            report(move |decoded| {
+                decoded.boundaries = vec![BoundaryCheck { axis: Axis::Row, bit: 3, legal: 900, illegal }];
+            })
+        };
+        assert_eq!(kinds(&crossings(30)), []);
+        assert_eq!(kinds(&crossings(2700)), [(Diagnosis::SwappedFrames, FAILED)]);
+        let message = &crossings(2700).reasons[0].message;
+        assert!(message.contains("2700 of 3600") && message.contains("row bit 3"), "{message}");
     }
 
     #[test]
