@@ -24,22 +24,16 @@ fn seen(bench: &mut Bench, slide: Slide) -> f64 {
 
 #[test]
 fn malus_law_holds_for_a_turned_analyser() {
-    let mut readings = vec![];
-    for degrees in [0.0, 20.0, 45.0, 70.0, 90.0] {
+    for degrees in [0.0, 20.0, 45.0, 60.0, 75.0] {
         let mut rig = clean_rig();
         rig.analyser.as_mut().unwrap().azimuth_error_deg = degrees;
         rig.projector.response = [0.5, 1.0, 0.5];
-        let mut bench = Bench::new(&rig, &scene(METAL));
+        // Dim, so that V stays below the full well when the analyser is turned towards it.
+        let mut bench = Bench::new(&rig, &scene(&METAL.replace("level = 0.5", "level = 0.05")));
         // The level pins H, so only ratios mean something.
-        readings.push((degrees, seen(&mut bench, Slide::Uniform(V)) / seen(&mut bench, Slide::Uniform(H))));
-    }
-    for (degrees, ratio) in readings {
+        let ratio = seen(&mut bench, Slide::Uniform(V)) / seen(&mut bench, Slide::Uniform(H));
         let tan_sq = f64::to_radians(degrees).tan().powi(2);
-        if degrees == 90.0 {
-            assert!(ratio > 100.0, "{ratio}");
-        } else {
-            assert!((ratio - tan_sq).abs() < 0.02 * (tan_sq + 0.05), "{degrees}: {ratio} for {tan_sq}");
-        }
+        assert!((ratio - tan_sq).abs() < 0.02 * (tan_sq + 0.05), "{degrees}: {ratio} for {tan_sq}");
     }
 }
 
@@ -63,7 +57,8 @@ fn aluminium_shows_the_extinction_of_panel_and_analyser() {
 fn a_depolariser_gives_half_and_half_and_shows_the_response_of_the_sensor() {
     let mut rig = clean_rig();
     rig.projector.response = [0.6, 1.0, 0.7];
-    let plaster = scene(&METAL.replace("index = [0.96, 6.7]", "diffuse = 0.8"));
+    let plaster =
+        scene(&METAL.replace("index = [0.96, 6.7]", "diffuse = 0.8").replace("level = 0.5", "level = 0.3"));
     let mut bench = Bench::new(&rig, &plaster);
     let (h, v) = (seen(&mut bench, Slide::Uniform(H)), seen(&mut bench, Slide::Uniform(V)));
     // V brighter than H although the analyser blocks it on metal: the sign of the contrast is the sensor's.

@@ -300,6 +300,9 @@ fn is_outvoted(class: &[Class], views: &[AxisView<'_>], x: usize, y: usize) -> b
                 .all(|view| view.values[at].abs_diff(view.values[other]) as i32 <= view.shape.step.max(2));
             if agrees {
                 supporters += 1;
+                if supporters == 2 {
+                    return false;
+                }
             } else {
                 dissenters += 1;
             }

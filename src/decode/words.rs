@@ -183,7 +183,6 @@ struct Scratch {
     squares: Vec<f32>,
     pairs: Vec<u32>,
     weakest: Vec<i32>,
-    weakest_bit: Vec<u8>,
     second: Vec<i32>,
     status: Vec<Status>,
 }
@@ -210,7 +209,6 @@ impl Scratch {
             squares: vec![0.0; width],
             pairs: vec![0; width],
             weakest: vec![0; width],
-            weakest_bit: vec![0; width],
             second: vec![0; width],
             status: vec![Status::Clear; width],
         }
@@ -225,6 +223,7 @@ impl Scratch {
     ) {
         let width = frames.width;
         let at = y * width..(y + 1) * width;
+        let full = gates.saturation_dn;
         self.saturated.fill(0);
         self.squares.fill(0.0);
         self.pairs.fill(0);
@@ -243,11 +242,12 @@ impl Scratch {
                         if gates.mode == Mode::Paper {
                             self.paper_bit(p, q, &frames.low, y, gates);
                         } else {
-                            self.pair_bit(p, q, gates);
+                            let (soft_at, saturated) = (&self.soft_at, &mut self.saturated);
+                            pair_bit(p, q, full, soft_at, &mut self.word, &mut self.soft, saturated);
                         }
-                        self.pair_sum(p, q, gates);
+                        pair_sum(p, q, full, &self.level_sum, &mut self.squares, &mut self.pairs);
                         if is_coarse(axis.code, bit as u8) {
-                            self.track_weakest(p, q, bit as u8);
+                            track_weakest(p, q, bit as u8, &mut self.weakest, &mut self.second);
                         }
                     }
                     BitFrames::Single(plane, inverse) => self.single_bit(&plane[at.clone()], inverse, gates),
@@ -330,20 +330,6 @@ impl Scratch {
         }
     }
 
-    /// Bit of a pair by the sign of its difference.
-    fn pair_bit<T: Sample>(&mut self, p: &[T], q: &[T], gates: &Gates) {
-        let width = p.len();
-        let (q, word, soft) = (&q[..width], &mut self.word[..width], &mut self.soft[..width]);
-        let (soft_at, saturated) = (&self.soft_at[..width], &mut self.saturated[..width]);
-        for x in 0..width {
-            let (p, q) = (p[x].dn(), q[x].dn());
-            word[x] = (word[x] << 1) | u16::from(p > q);
-            soft[x] = (soft[x] << 1) | u16::from((p - q).abs() <= soft_at[x]);
-            let (p_full, q_full) = (p >= gates.saturation_dn, q >= gates.saturation_dn);
-            saturated[x] |= u8::from(p_full | q_full) | (u8::from(p_full & q_full) << 1);
-        }
-    }
-
     /// Bit of a pair by its degrees of linear polarization (method, section 3). Where these are equal the bit is lost.
     fn paper_bit<T: Sample>(&mut self, p: &[T], q: &[T], dark: &[&[T]], y: usize, gates: &Gates) {
         let width = p.len();
@@ -373,35 +359,6 @@ impl Scratch {
         }
     }
 
-    /// Collects the residual of the pair sum where no frame of the pair is saturated.
-    fn pair_sum<T: Sample>(&mut self, p: &[T], q: &[T], gates: &Gates) {
-        let width = p.len();
-        let (q, sums) = (&q[..width], &self.level_sum[..width]);
-        let (squares, pairs) = (&mut self.squares[..width], &mut self.pairs[..width]);
-        for x in 0..width {
-            let (p, q) = (p[x].dn(), q[x].dn());
-            let free = p < gates.saturation_dn && q < gates.saturation_dn;
-            let residual = (p + q) as f32 - sums[x];
-            squares[x] += if free { residual * residual } else { 0.0 };
-            pairs[x] += u32::from(free);
-        }
-    }
-
-    /// Keeps the two smallest |P - Q| of the coarse bits: at most one of them is near its own edge.
-    fn track_weakest<T: Sample>(&mut self, p: &[T], q: &[T], bit: u8) {
-        let width = p.len();
-        let q = &q[..width];
-        let (weakest, second) = (&mut self.weakest[..width], &mut self.second[..width]);
-        let weakest_bit = &mut self.weakest_bit[..width];
-        for x in 0..width {
-            let size = (p[x].dn() - q[x].dn()).abs();
-            let weaker = size < weakest[x];
-            second[x] = if weaker { weakest[x] } else { second[x].min(size) };
-            weakest_bit[x] = if weaker { bit } else { weakest_bit[x] };
-            weakest[x] = weakest[x].min(size);
-        }
-    }
-
     /// Words of one axis to values.
     fn resolve<T>(
         &mut self,
@@ -418,10 +375,11 @@ impl Scratch {
             row.values[index][x] = value;
             self.status[x] = self.status[x].max(status);
             if value >= 0 && self.weakest[x] != i32::MAX {
-                let near = boundary_distance(axis.code, self.weakest_bit[x], value) <= EDGE_REACH;
-                let size = if near { self.second[x] } else { self.weakest[x] };
-                if size != i32::MAX {
-                    weak[x] = weak[x].min(size as f32);
+                let bit = (self.weakest[x] & ((1 << WEAK_BIT_SHIFT) - 1)) as u8;
+                let near = boundary_distance(axis.code, bit, value) <= EDGE_REACH;
+                let key = if near { self.second[x] } else { self.weakest[x] };
+                if key != i32::MAX {
+                    weak[x] = weak[x].min((key >> WEAK_BIT_SHIFT) as f32);
                 }
             }
         }
@@ -474,6 +432,58 @@ impl Scratch {
         }
     }
 }
+
+// The kernels of the inner loops are functions of slices: that no two of them overlap is then known to the compiler,
+// which vectorises the loops.
+
+/// Bit of a pair by the sign of its difference.
+fn pair_bit<T: Sample>(
+    p: &[T],
+    q: &[T],
+    full: i32,
+    soft_at: &[i32],
+    word: &mut [u16],
+    soft: &mut [u16],
+    saturated: &mut [u8],
+) {
+    let width = p.len();
+    let (q, soft_at) = (&q[..width], &soft_at[..width]);
+    let (word, soft, saturated) = (&mut word[..width], &mut soft[..width], &mut saturated[..width]);
+    for x in 0..width {
+        let (p, q) = (p[x].dn(), q[x].dn());
+        word[x] = (word[x] << 1) | u16::from(p > q);
+        soft[x] = (soft[x] << 1) | u16::from((p - q).abs() <= soft_at[x]);
+        saturated[x] |= u8::from(p.max(q) >= full) | (u8::from(p.min(q) >= full) << 1);
+    }
+}
+
+/// Collects the residual of the pair sum where no frame of the pair is saturated.
+fn pair_sum<T: Sample>(p: &[T], q: &[T], full: i32, sums: &[f32], squares: &mut [f32], pairs: &mut [u32]) {
+    let width = p.len();
+    let (q, sums) = (&q[..width], &sums[..width]);
+    let (squares, pairs) = (&mut squares[..width], &mut pairs[..width]);
+    for x in 0..width {
+        let (p, q) = (p[x].dn(), q[x].dn());
+        let free = i32::from(p.max(q) < full);
+        let residual = ((p + q) as f32 - sums[x]) * free as f32;
+        squares[x] += residual * residual;
+        pairs[x] += free as u32;
+    }
+}
+
+/// Keeps the two smallest |P - Q| of the coarse bits (at most one of them is near its own edge), each with its bit.
+fn track_weakest<T: Sample>(p: &[T], q: &[T], bit: u8, weakest: &mut [i32], second: &mut [i32]) {
+    let width = p.len();
+    let (q, weakest, second) = (&q[..width], &mut weakest[..width], &mut second[..width]);
+    for x in 0..width {
+        let key = ((p[x].dn() - q[x].dn()).abs() << WEAK_BIT_SHIFT) | i32::from(bit);
+        second[x] = second[x].min(weakest[x].max(key));
+        weakest[x] = weakest[x].min(key);
+    }
+}
+
+/// Bits of a key of [`track_weakest`] that hold the bit's number.
+const WEAK_BIT_SHIFT: u32 = 5;
 
 /// Value of a word with at most one soft bit. A single soft bit is an edge where both readings are neighbours.
 fn resolve_word(code: PrefixCode, word: u16, soft: u16) -> (i32, Status) {

@@ -57,18 +57,30 @@ class Check:
         if not self.expect(path.is_file(), "manifest.json is missing"):
             return
         manifest = json.loads(path.read_text(encoding="utf-8"))
-        self.manifest(manifest)
-        self.files(manifest)
-        size = self.frames(manifest)
-        mask = self.maps(size)
-        self.cloud(mask)
-        self.report(manifest)
-        if (self.folder / "truth.npz").exists():
-            truth = self.archive("truth.npz", TRUTH, size)
-            if truth:
-                objects = manifest.get("truth_objects") or []
-                indices = set(numpy.unique(truth["object"])) - {255}
-                self.expect(max(indices, default=-1) < len(objects), "truth.npz has objects without a name")
+        self.step("manifest.json", self.manifest, manifest)
+        self.step("files", self.files, manifest)
+        size = self.step("frames.npy", self.frames, manifest)
+        mask = self.step("maps.npz", self.maps, size)
+        self.step("cloud.ply", self.cloud, mask)
+        self.step("report.json", self.report, manifest)
+        self.step("truth.npz", self.truth, manifest, size)
+
+    def step(self, name, check, *given):
+        """Runs one check; what cannot even be read is a fault as well, and does not hide the next."""
+        try:
+            return check(*given)
+        except Exception as error:  # noqa: BLE001 - a damaged file can fail in any way
+            self.expect(False, f"{name} cannot be checked: {type(error).__name__}: {error}")
+            return None
+
+    def truth(self, manifest, size):
+        if not (self.folder / "truth.npz").exists():
+            return
+        truth = self.archive("truth.npz", TRUTH, size)
+        if truth:
+            objects = manifest.get("truth_objects") or []
+            indices = set(numpy.unique(truth["object"])) - {255}
+            self.expect(max(indices, default=-1) < len(objects), "truth.npz has objects without a name")
 
     def manifest(self, manifest):
         self.expect(manifest.get("schema") == "polscan.bundle/1", "manifest: wrong schema")
@@ -155,7 +167,7 @@ class Check:
             return None
         for key, dtype in arrays.items():
             self.expect(values[key].dtype == dtype, f"{name}: {key} has type {values[key].dtype}, expected {dtype}")
-            self.expect(values[key].shape == tuple(size), f"{name}: {key} has shape {values[key].shape}, frames {size}")
+            self.expect(size is None or values[key].shape == tuple(size), f"{name}: {key} has shape {values[key].shape}, frames {size}")
         return values
 
     def maps(self, size):

@@ -72,6 +72,7 @@ fn decode(calibration: &Calibration, scene: &Scene, rows: bool) -> (Decoded, Gri
         noise_estimated: false,
         black_level_dn: 0.0,
         pairs: Vec::new(),
+        boundaries: Vec::new(),
         drift: None,
         losses: Vec::new(),
     };

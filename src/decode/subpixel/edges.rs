@@ -42,8 +42,8 @@ impl Line {
 pub(super) struct Edge {
     /// Position on the line in px.
     pub position: f64,
-    /// Variance of `position` in px^2.
-    pub variance: f64,
+    /// Inverse variance of `position` in 1/px^2.
+    pub weight: f64,
     /// Projector coordinate of the boundary.
     pub u: f64,
     /// Whether the value rises with the position.
@@ -254,7 +254,7 @@ impl<'a, T: Sample> EdgeFinder<'a, T> {
                 EdgeForm::PartialArea => self.partial_area(line, position, value, bit).unwrap_or(two_point),
             };
             let u = self.code.boundary(value);
-            edges.push(Edge { position: place, variance: variance + self.floor, u, rising: to > from });
+            edges.push(Edge { position: place, weight: 1.0 / (variance + self.floor), u, rising: to > from });
         }
         edges[first..].sort_by(|a, b| a.position.total_cmp(&b.position));
     }
@@ -326,8 +326,8 @@ fn close_run(edges: &mut Vec<Edge>, first: usize) {
             let rising = edges[at].rising;
             let signed = |edge: &Edge| if edge.rising == rising { edge.position } else { -edge.position };
             let position = edges[at..at + group].iter().map(signed).sum();
-            let variance = edges[at..at + group].iter().map(|edge| edge.variance).sum();
-            edges[kept] = Edge { position, variance, u, rising };
+            let variance: f64 = edges[at..at + group].iter().map(|edge| 1.0 / edge.weight).sum();
+            edges[kept] = Edge { position, weight: 1.0 / variance, u, rising };
             kept += 1;
         }
         at += group;
@@ -341,7 +341,7 @@ pub(super) fn straightness(edges: &[Edge], triples: &mut Vec<(f64, f64)>) {
         let [a, b, c] = [three[0], three[1], three[2]];
         if b.u - a.u == c.u - b.u && (b.u - a.u).abs() == 1.0 {
             let bend = a.position - 2.0 * b.position + c.position;
-            triples.push((a.variance + 4.0 * b.variance + c.variance, bend * bend));
+            triples.push((1.0 / a.weight + 4.0 / b.weight + 1.0 / c.weight, bend * bend));
         }
     }
 }

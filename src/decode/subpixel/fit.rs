@@ -29,13 +29,18 @@ pub(super) struct Fit {
 }
 
 impl Fit {
+    fn value(&self, position: f64) -> f64 {
+        let t = position - self.origin;
+        let [c0, c1, c2] = self.coefficients;
+        c0 + t * (c1 + t * c2)
+    }
+
     /// Coordinate and its variance at a position.
     pub fn at(&self, position: f64) -> (f64, f64) {
         let t = position - self.origin;
-        let [c0, c1, c2] = self.coefficients;
         let [v00, v01, v02, v11, v12, v22] = self.covariance;
         let variance = v00 + t * (2.0 * v01 + t * (v11 + 2.0 * v02 + t * (2.0 * v12 + t * v22)));
-        (c0 + t * (c1 + t * c2), variance)
+        (self.value(position), variance)
     }
 }
 
@@ -54,7 +59,7 @@ impl Sums {
         let (origin, base) = (edges[edges.len() / 2].position, edges[edges.len() / 2].u);
         let mut sums = Self { origin, base, t: [0.0; 5], u: [0.0; 3] };
         for edge in edges {
-            let (t, u, w) = (edge.position - origin, edge.u - base, 1.0 / edge.variance);
+            let (t, u, w) = (edge.position - origin, edge.u - base, edge.weight);
             let tt = t * t;
             for (sum, power) in sums.t.iter_mut().zip([1.0, t, tt, tt * t, tt * tt]) {
                 *sum += w * power;
@@ -107,10 +112,11 @@ fn scale(fit: &mut Fit, edges: &[Edge], parameters: usize) -> f64 {
     let chi2 = edges
         .iter()
         .map(|edge| {
-            let off = edge.u - fit.at(edge.position).0;
-            off * off * per_slope / edge.variance
+            let off = edge.u - fit.value(edge.position);
+            off * off * edge.weight
         })
-        .sum::<f64>();
+        .sum::<f64>()
+        * per_slope;
     let freedom = edges.len() - parameters;
     let excess = if freedom > 0 { (chi2 / freedom as f64).max(1.0) } else { 1.0 };
     for entry in &mut fit.covariance {

@@ -97,3 +97,26 @@ fn probe() {
         }
     }
 }
+
+/// Time of a decode of the size of the paper's rig. Run with `--release -- --ignored --nocapture`.
+#[test]
+#[ignore = "a measurement, not a check"]
+fn timing_at_full_size() {
+    let rig = Rig { width: 1600, height: 1200, ..Rig::default() };
+    let scene = slanted(0.3, 0.331);
+    let sequence = sequence(Mode::Pse);
+    let frames: Vec<(polscan_patterns::Role, crate::decode::SharedPlane)> = rig
+        .cached_scan(&scene, &sequence)
+        .into_iter()
+        .map(|(role, frame)| (role, std::sync::Arc::new(frame) as crate::decode::SharedPlane))
+        .collect();
+    for round in 0..6 {
+        let mut accumulator = crate::decode::Accumulator::new(rig.settings(&sequence)).unwrap();
+        for (role, plane) in &frames {
+            accumulator.push(*role, plane.clone()).unwrap();
+        }
+        let start = std::time::Instant::now();
+        let decoded = accumulator.finish().unwrap();
+        println!("round {round}: {:.0} ms, {}", start.elapsed().as_secs_f64() * 1e3, classes(&decoded));
+    }
+}

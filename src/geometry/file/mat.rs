@@ -7,7 +7,7 @@ use std::io::Read;
 
 use flate2::read::ZlibDecoder;
 
-use super::value::{Array, MAX_ELEMENTS, Node, Nodes};
+use super::value::{Array, MAX_ELEMENTS, MAX_VARIABLES, Node, Nodes};
 
 const HEADER: usize = 128;
 /// An array of `MAX_ELEMENTS` doubles with its tags and name.
@@ -28,7 +28,12 @@ pub(super) fn read(bytes: &[u8]) -> Result<Nodes, String> {
     };
     let mut nodes = Nodes::new();
     let mut cursor = Cursor { bytes: &bytes[HEADER..], big_endian };
+    let mut elements = 0;
     while !cursor.bytes.is_empty() {
+        elements += 1;
+        if elements > MAX_VARIABLES {
+            return Err(format!("it holds more than {MAX_VARIABLES} variables"));
+        }
         let at = bytes.len() - cursor.bytes.len();
         let (kind, length, small) = cursor.tag().ok_or_else(|| format!("it is cut short at byte {at}"))?;
         if small || length > cursor.bytes.len() {

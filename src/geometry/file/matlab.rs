@@ -1,7 +1,7 @@
 //! The part of MATLAB's language that the toolbox writes its results in: assignments of numbers and of matrices of
 //! numbers. Everything else is passed over.
 
-use super::value::{Array, MAX_ELEMENTS, Node, Nodes};
+use super::value::{Array, MAX_ELEMENTS, MAX_VARIABLES, Node, Nodes};
 
 /// Reads all assignments of numbers.
 pub(super) fn read(text: &str) -> Result<Nodes, String> {
@@ -13,6 +13,9 @@ pub(super) fn read(text: &str) -> Result<Nodes, String> {
             && let Some(array) = parse(value.trim())
         {
             nodes.insert(name.to_owned(), Node::Array(array));
+            if nodes.len() > MAX_VARIABLES {
+                return Err(format!("it holds more than {MAX_VARIABLES} variables"));
+            }
         }
     }
     if nodes.is_empty() {

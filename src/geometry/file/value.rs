@@ -8,7 +8,9 @@ use super::ReadHints;
 use crate::geometry::{Calibration, Lens, Pose, Projector, Quality};
 
 /// Larger arrays are corners, images and covariances: nothing that is needed here.
-pub(super) const MAX_ELEMENTS: usize = 4096;
+pub(super) const MAX_ELEMENTS: usize = 256;
+/// Results of a hundred views have a few thousand variables.
+pub(super) const MAX_VARIABLES: usize = 20_000;
 /// Rotations printed with few digits are brought back to the nearest rotation, up to this error.
 const PRINTED_ROTATION: f64 = 1e-3;
 

@@ -25,7 +25,7 @@ pub(super) fn read(text: &str) -> Result<Nodes, String> {
     }
     let mut nodes = Nodes::new();
     for entry in entries(&lines, 0)? {
-        if let Some(node) = value(&entry).map_err(|fault| format!("{} {fault}", entry.key))?
+        if let Some(node) = value(&entry, true).map_err(|fault| format!("{} {fault}", entry.key))?
             && nodes.insert(entry.key.to_owned(), node).is_some()
         {
             return Err(format!("{} occurs twice", entry.key));
@@ -84,7 +84,8 @@ fn shorten(line: &str) -> String {
     line.trim().chars().take(40).collect()
 }
 
-fn value(entry: &Entry<'_>) -> Result<Option<Node>, String> {
+/// Value of an entry; `nested` allows it to be a matrix, which bounds the recursion.
+fn value(entry: &Entry<'_>, nested: bool) -> Result<Option<Node>, String> {
     if entry.inline.starts_with('[') {
         let mut text = entry.inline.to_owned();
         for line in entry.block {
@@ -106,7 +107,7 @@ fn value(entry: &Entry<'_>) -> Result<Option<Node>, String> {
     if first.trim_start().starts_with('-') && first.trim_start()[1..].starts_with(' ') {
         return block_list(entry.block);
     }
-    matrix(entry.block, indentation(first))
+    if nested { matrix(entry.block, indentation(first)) } else { Ok(None) }
 }
 
 /// `- 1` or `- [1, 2]` per line; `None` for lists of other things.
@@ -138,7 +139,7 @@ fn matrix(block: &[&str], indent: usize) -> Result<Option<Node>, String> {
     if rows.checked_mul(columns).is_none_or(|n| n > MAX_ELEMENTS) {
         return Ok(None);
     }
-    match value(data)? {
+    match value(data, false)? {
         Some(Node::Array(array)) if array.data.len() == rows * columns => {
             Ok(Some(Node::Array(Array { rows, columns, data: array.data })))
         }

@@ -73,9 +73,9 @@ pub(super) fn fit(picture: &RgbImage, width: u32, height: u32) -> RgbImage {
     imageops::thumbnail(picture, side(picture.width()), side(picture.height()))
 }
 
-/// Width that [`color_bar`] needs beside a picture of `height` px.
-pub(super) fn bar_width(height: u32) -> u32 {
-    (text_height(height) * 9.0) as u32
+/// Width that [`color_bar`] needs with capitals of `letters` px.
+pub(super) fn bar_width(letters: f32) -> u32 {
+    (letters * 9.0) as u32
 }
 
 /// Height of capitals that suits a picture of `height` px.
@@ -83,16 +83,20 @@ pub(super) fn text_height(height: u32) -> f32 {
     (height as f32 / 50.0).clamp(7.0, 24.0)
 }
 
+/// A colour bar to draw.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct ColorBar<'a> {
+    pub map: Colormap,
+    pub range: Range,
+    pub unit: &'a str,
+    /// Height of capitals in px.
+    pub letters: f32,
+}
+
 /// Draws a colour bar with ticks and unit into the margin that begins at column `x`, beside rows `y..y + height`.
-pub(super) fn color_bar(
-    image: &mut RgbImage,
-    (x, y, height): (u32, u32, u32),
-    map: Colormap,
-    range: Range,
-    unit: &str,
-) {
-    let ink = Ink { height: text_height(height), color: INK };
-    let gap = ink.height;
+pub(super) fn color_bar(image: &mut RgbImage, (x, y, height): (u32, u32, u32), bar: ColorBar<'_>) {
+    let ColorBar { map, range, unit, letters: gap } = bar;
+    let ink = Ink { height: gap, color: INK };
     // The unit stands above the bar, and half a number above and below its ends.
     let (top, bottom) = (y as f32 + 3.2 * gap, (y + height) as f32 - 1.2 * gap);
     text::draw(image, unit, (x as f32 + gap, y as f32 + 0.6 * gap), ink);

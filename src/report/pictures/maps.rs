@@ -111,9 +111,10 @@ fn colored<T: Sync>(values: &Grid<T>, color: impl Fn(&T) -> Rgb + Sync) -> RgbIm
 
 fn with_bar(picture: &RgbImage, map: Colormap, range: Range, unit: &str) -> RgbImage {
     let (width, height) = picture.dimensions();
-    let mut image = blank(width + canvas::bar_width(height), height, WHITE);
+    let letters = canvas::text_height(height);
+    let mut image = blank(width + canvas::bar_width(letters), height, WHITE);
     image::imageops::replace(&mut image, picture, 0, 0);
-    canvas::color_bar(&mut image, (width, 0, height), map, range, unit);
+    canvas::color_bar(&mut image, (width, 0, height), canvas::ColorBar { map, range, unit, letters });
     image
 }
 

@@ -22,6 +22,12 @@ const GAP: u32 = 26;
 /// Height of titles in px.
 const TITLE_HEIGHT: f32 = 15.0;
 
+/// Height of numbers in px.
+const NUMBER_HEIGHT: f32 = 11.0;
+
+/// Width for a colour bar or a legend at the right of a tile, in px.
+const MARGIN: u32 = 176;
+
 /// Colour where a map has no value.
 const MISSING: Rgb = WHITE;
 
@@ -68,9 +74,8 @@ pub fn overview(input: &OverviewInput<'_>) -> RgbImage {
     let tiles = tiles(input);
     let height = |picture: &RgbImage| canvas::fit(picture, TILE_WIDTH, 2 * TILE_WIDTH).height();
     let tile_height = tiles.iter().map(|tile| height(&tile.picture)).max().unwrap_or(1);
-    let margin = canvas::bar_width(tile_height).max(150);
     let (cell_width, cell_height) =
-        (TILE_WIDTH + margin + GAP, tile_height + GAP + (2.2 * TITLE_HEIGHT) as u32);
+        (TILE_WIDTH + MARGIN + GAP, tile_height + GAP + (2.2 * TITLE_HEIGHT) as u32);
     let columns = 3;
     let rows = (tiles.len() as u32).div_ceil(columns);
     let heading = (4.4 * TITLE_HEIGHT) as u32;
@@ -134,9 +139,10 @@ fn place(sheet: &mut RgbImage, tile: &Tile, (x, y): (u32, u32), class: &Grid<u8>
     imageops::replace(sheet, &picture, i64::from(x), i64::from(y));
     canvas::outline(sheet, (x.saturating_sub(1), y.saturating_sub(1)), (width + 2, height + 2), FAINT);
     if let Some((map, range, unit)) = tile.bar {
-        canvas::color_bar(sheet, (x + width, y, height), map, range, unit);
+        let bar = canvas::ColorBar { map, range, unit, letters: NUMBER_HEIGHT };
+        canvas::color_bar(sheet, (x + width, y, height), bar);
     } else if tile.title == "class" {
-        super::maps::class_legend(sheet, class, (x + width, y), canvas::text_height(height));
+        super::maps::class_legend(sheet, class, (x + width, y), NUMBER_HEIGHT);
     }
 }
 

@@ -537,3 +537,48 @@ fn a_real_file_system_that_is_full_is_told_before_it_is_filled() {
     assert!(matches!(error, StorageError::Space { .. }), "{error}");
     assert!(names(folder.path()).is_empty());
 }
+
+/// Tells the child process below where to write.
+const CHILD_TARGET: &str = "POLSCAN_TEST_KILLED_WRITER_TARGET";
+
+#[test]
+#[ignore = "started by the test that kills it"]
+fn a_writer_that_waits_to_be_killed() {
+    let out = std::env::var_os(CHILD_TARGET).expect("started by the test that kills it");
+    let writer = BundleWriter::create(Path::new(&out), None, 0).unwrap();
+    fill(&writer).unwrap();
+    println!("written");
+    std::thread::sleep(Duration::from_secs(600));
+}
+
+#[test]
+fn a_killed_process_leaves_nothing_under_the_name_and_stops_nobody() {
+    use std::io::{BufRead, BufReader};
+    let folder = TempDir::new().unwrap();
+    let out = folder.path().join("scan");
+    let mut child = std::process::Command::new(std::env::current_exe().unwrap())
+        .args([
+            "--exact",
+            "store::bundle::tests::a_writer_that_waits_to_be_killed",
+            "--ignored",
+            "--nocapture",
+        ])
+        .env(CHILD_TARGET, &out)
+        .stdout(std::process::Stdio::piped())
+        .spawn()
+        .unwrap();
+    let lines = BufReader::new(child.stdout.take().unwrap()).lines();
+    let written = lines.map_while(Result::ok).any(|line| line.contains("written"));
+    let busy = matches!(BundleWriter::create(&out, None, 0), Err(StorageError::Busy { .. }));
+    let seen_alive = stale_partials(folder.path()).unwrap();
+    child.kill().unwrap();
+    child.wait().unwrap();
+    assert!(written && busy && seen_alive.is_empty());
+    assert_eq!(names(folder.path()), ["scan.partial"]);
+    assert_eq!(stale_partials(folder.path()).unwrap(), [folder.path().join("scan.partial")]);
+    let writer = BundleWriter::create(&out, None, 0).unwrap();
+    fill(&writer).unwrap();
+    writer.finish(manifest()).unwrap();
+    assert_whole(&out);
+    assert_eq!(names(folder.path()), ["scan"]);
+}

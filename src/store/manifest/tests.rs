@@ -307,7 +307,7 @@ fn a_full_manifest_of_our_own_survives() {
     manifest.processing = Some(Processing {
         volume: Some(Volume { near_mm: 800.0, far_mm: 1200.0 }),
         regions: vec![NamedRegion { name: "a".to_owned(), x: 1, y: 2, width: 3, height: 4 }],
-        reconstruction: json!({"row_gate_px": 1.5}),
+        row_gate_px: 2.5,
         ..Processing::default()
     });
     manifest.files.insert("frames.npy".to_owned(), FileEntry { bytes: 1, sha256: "0".repeat(64) });

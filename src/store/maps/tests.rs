@@ -24,6 +24,7 @@ fn decoded(column: Vec<f32>, class: Vec<Class>) -> Decoded {
         noise_estimated: false,
         black_level_dn: 0.0,
         pairs: Vec::new(),
+        boundaries: Vec::new(),
         drift: None,
         losses: Vec::new(),
     }

@@ -121,13 +121,15 @@ pub fn cloud_view(cloud: &Cloud, settings: &ViewSettings) -> RgbImage {
         return picture;
     };
     let depth_scale = settings.depth_scale.unwrap_or_else(|| suitable_scale(low, high)).clamp(0.01, 1000.0);
-    let bar = canvas::bar_width(height);
+    let bar = canvas::bar_width(letters);
     let factor = OVERSAMPLING as f32;
+    // Room for numbers and names around the box, less where the picture itself is small.
+    let room = |letters: f32, side: u32| letters.min(0.2 * side as f32);
     let inner = [
-        5.0 * letters,
-        3.0 * letters,
-        width as f32 - bar as f32 - 4.0 * letters,
-        height as f32 - 5.0 * letters,
+        room(12.0 * letters, width),
+        room(3.0 * letters, height),
+        width as f32 - room((bar as f32) + 10.0 * letters, 2 * width),
+        height as f32 - room(5.0 * letters, height),
     ];
     let view = Projection::of_box(low, high, settings, depth_scale, inner);
     let fine = Projection {
@@ -137,21 +139,17 @@ pub fn cloud_view(cloud: &Cloud, settings: &ViewSettings) -> RgbImage {
     };
     let range = Range { low: low[2], high: high[2] };
     let mut canvas = blank(width * OVERSAMPLING, height * OVERSAMPLING, WHITE);
-    draw_walls(&mut canvas, &fine, low, high, factor);
+    let axes = axes(&view, low, high, letters);
+    draw_walls(&mut canvas, &fine, &axes, factor);
     raster::surface(&mut canvas, &mesh, &fine, range);
     let mut picture = imageops::thumbnail(&canvas, width, height);
-    draw_labels(&mut picture, &view, (low, high), letters);
+    draw_labels(&mut picture, &view, &axes, letters);
     if depth_scale != 1.0 {
         let note = format!("depth ×{}", ticks::label(depth_scale, usize::from(depth_scale.fract() != 0.0)));
         text::draw(&mut picture, &note, (letters, letters), Ink { height: letters, color: INK });
     }
-    canvas::color_bar(
-        &mut picture,
-        (width - bar, height / 8, height * 3 / 4),
-        Colormap::Parula,
-        range,
-        "z mm",
-    );
+    let bar_style = canvas::ColorBar { map: Colormap::Parula, range, unit: "z mm", letters };
+    canvas::color_bar(&mut picture, (width - bar, height / 8, height * 3 / 4), bar_style);
     picture
 }
 
@@ -161,9 +159,40 @@ fn suitable_scale(low: Vector, high: Vector) -> f32 {
     (0.33 * wide / (high[2] - low[2]).max(1e-6)).floor().clamp(1.0, 5.0)
 }
 
-/// Ticks of an axis of the box.
-fn axis_ticks(low: f32, high: f32) -> (Vec<f32>, usize) {
-    ticks::ticks(low, high, 5)
+/// One axis of the box.
+struct AxisTicks {
+    name: &'static str,
+    low: f32,
+    high: f32,
+    values: Vec<f32>,
+    decimals: usize,
+    /// The edge that carries its numbers, from `low` to `high`.
+    edge: [Vector; 2],
+}
+
+/// The axes with as many ticks as their edges have room for.
+fn axes(view: &Projection, low: Vector, high: Vector, letters: f32) -> [AxisTicks; 3] {
+    let far = far_sides(view);
+    let side = |axis: usize, is_far: bool| if far[axis] == is_far { high[axis] } else { low[axis] };
+    std::array::from_fn(|axis| {
+        // x and z run along the floor's near edges, y along the upright edge where the far side wall comes near.
+        let at = match axis {
+            0 => [0.0, side(1, true), side(2, false)],
+            1 => [side(0, true), 0.0, side(2, false)],
+            _ => [side(0, false), side(1, true), 0.0],
+        };
+        let mut edge = [at; 2];
+        (edge[0][axis], edge[1][axis]) = (low[axis], high[axis]);
+        let [from, to] = edge.map(|end| view.pixel(end));
+        // Numbers beside each other need more room than numbers below each other.
+        let count = match axis {
+            0 => (to[0] - from[0]).abs() / (6.0 * letters),
+            _ => (to[1] - from[1]).abs() / (2.0 * letters),
+        };
+        let wanted = count.clamp(1.0, 6.0) as usize;
+        let (values, decimals) = ticks::ticks(low[axis], high[axis], wanted);
+        AxisTicks { name: ["x", "y", "z"][axis], low: low[axis], high: high[axis], values, decimals, edge }
+    })
 }
 
 /// Sides of the box that the eye sees from inside: for each axis whether it is the upper one.
@@ -176,19 +205,18 @@ fn far_sides(view: &Projection) -> [bool; 3] {
 }
 
 /// The three far sides of the box, with a grid.
-fn draw_walls(image: &mut RgbImage, view: &Projection, low: Vector, high: Vector, width: f32) {
+fn draw_walls(image: &mut RgbImage, view: &Projection, axes: &[AxisTicks; 3], width: f32) {
     let far = far_sides(view);
     for wall in 0..3 {
-        let level = if far[wall] { high[wall] } else { low[wall] };
+        let level = if far[wall] { axes[wall].high } else { axes[wall].low };
         for axis in (0..3).filter(|&axis| axis != wall) {
             let other = 3 - wall - axis;
-            let (values, _) = axis_ticks(low[axis], high[axis]);
-            let edges = [low[axis], high[axis]];
-            for value in values.into_iter().chain(edges) {
+            let edges = [axes[axis].low, axes[axis].high];
+            for &value in axes[axis].values.iter().chain(&edges) {
                 let mut from = [0.0; 3];
-                (from[wall], from[axis], from[other]) = (level, value, low[other]);
+                (from[wall], from[axis], from[other]) = (level, value, axes[other].low);
                 let mut to = from;
-                to[other] = high[other];
+                to[other] = axes[other].high;
                 let [from, to] = [view.pixel(from), view.pixel(to)];
                 let thick = if edges.contains(&value) { 1.4 * width } else { width };
                 line(image, (from[0], from[1]), (to[0], to[1]), thick, FAINT);
@@ -197,49 +225,40 @@ fn draw_walls(image: &mut RgbImage, view: &Projection, low: Vector, high: Vector
     }
 }
 
-/// Numbers along three edges of the box on the outline of the picture.
-fn draw_labels(image: &mut RgbImage, view: &Projection, (low, high): (Vector, Vector), letters: f32) {
-    let far = far_sides(view);
+/// Numbers along the edges of the axes, and their names.
+fn draw_labels(image: &mut RgbImage, view: &Projection, axes: &[AxisTicks; 3], letters: f32) {
     let ink = Ink { height: letters, color: INK };
-    let center = view.pixel(std::array::from_fn(|axis| 0.5 * (low[axis] + high[axis])));
-    for (axis, name) in ["x", "y", "z"].into_iter().enumerate() {
-        // x and z run along the floor's near edges, y along the upright edge where the far side wall comes near.
-        let side = |of: usize, near: bool| if far[of] == near { low[of] } else { high[of] };
-        let mut edge = match axis {
-            0 => [0.0, side(1, false), side(2, true)],
-            1 => [side(0, false), 0.0, side(2, true)],
-            _ => [side(0, true), side(1, false), 0.0],
+    let middle = |a: f32, b: f32| 0.5 * (a + b);
+    let center = view.pixel(std::array::from_fn(|axis| middle(axes[axis].low, axes[axis].high)));
+    for (axis, of) in axes.iter().enumerate() {
+        let at = |value: f32| {
+            let mut point = of.edge[0];
+            point[axis] = value;
+            view.pixel(point)
         };
-        let (values, decimals) = axis_ticks(low[axis], high[axis]);
+        let [x, y, _] = at(middle(of.low, of.high));
+        // Numbers stand below the edge of x and beside the other two.
+        let (dx, dy) =
+            if axis == 0 { (0.0, (y - center[1]).signum()) } else { ((x - center[0]).signum(), 0.0) };
+        for &value in &of.values {
+            let [x, y, _] = at(value);
+            line(image, (x, y), (x + 0.5 * letters * dx, y + 0.5 * letters * dy), 1.0, INK);
+        }
         let mut write = |value: f32, label: &str, away: f32| {
-            edge[axis] = value;
-            let [x, y, _] = view.pixel(edge);
-            let (dx, dy) = outward((x - center[0], y - center[1]), axis);
-            let (cx, cy) = (x + away * letters * dx, y + away * letters * dy);
-            if away < 2.0 {
-                line(image, (x, y), (x + 0.5 * letters * dx, y + 0.5 * letters * dy), 1.0, INK);
-            }
-            // Beside upright edges numbers end at the edge; below the floor they hang from it.
-            let left = if axis == 1 {
-                cx - text::width(label, letters)
-            } else {
-                cx - 0.5 * text::width(label, letters)
-            };
-            let top = if axis == 1 { cy - 0.5 * letters } else { cy };
+            let [x, y, _] = at(value);
+            let (cx, cy) = (x + away * dx, y + away * dy);
+            let width = text::width(label, letters);
+            let left = cx - 0.5 * (1.0 - dx) * width;
+            let top = cy - 0.5 * (1.0 - dy) * letters;
             text::draw(image, label, (left, top), ink);
         };
-        for value in values {
-            write(value, &ticks::label(value, decimals), 0.9);
+        let labels: Vec<String> = of.values.iter().map(|&value| ticks::label(value, of.decimals)).collect();
+        for (&value, label) in of.values.iter().zip(&labels) {
+            write(value, label, 0.9 * letters);
         }
-        write(0.5 * (low[axis] + high[axis]), &format!("{name} (mm)"), if axis == 1 { 4.2 } else { 2.9 });
-    }
-}
-
-/// Direction in the picture in which the labels of `axis` stand off their edge.
-fn outward((dx, dy): (f32, f32), axis: usize) -> (f32, f32) {
-    match axis {
-        1 => (dx.signum(), 0.0),
-        _ => (0.25 * dx.signum(), dy.signum()),
+        let widest = labels.iter().map(|label| text::width(label, letters)).fold(0.0, f32::max);
+        let beyond = if axis == 0 { 1.5 * letters } else { widest + letters };
+        write(middle(of.low, of.high), &format!("{} (mm)", of.name), 0.9 * letters + beyond);
     }
 }
 

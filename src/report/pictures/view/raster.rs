@@ -15,10 +15,13 @@ use crate::report::{
 const LAMP: Vector = [-0.45, -0.58, -0.68];
 
 /// Share of the light that comes from everywhere.
-const AMBIENT: f32 = 0.42;
+const AMBIENT: f32 = 0.5;
+
+/// Brightness of the lamp: surfaces at a slant to it have the colours of the bar.
+const BRIGHTNESS: f32 = 1.35;
 
 /// Strength and sharpness of the lamp's reflection.
-const GLOSS: (f32, i32) = (0.16, 18);
+const GLOSS: (f32, i32) = (0.1, 18);
 
 /// A corner of a triangle in the picture.
 #[derive(Debug, Clone, Copy)]
@@ -74,7 +77,7 @@ fn shade(color: Rgb, [nx, ny, nz]: Vector, view: &Projection) -> [f32; 3] {
     let half_length = half.iter().map(|value| value * value).sum::<f32>().sqrt();
     let gloss = turned.iter().zip(half).map(|(n, h)| n * h).sum::<f32>() / (length * half_length);
     // Surfaces are seen from both sides.
-    let light = AMBIENT + (1.0 - AMBIENT) * 1.12 * cosine.abs();
+    let light = (AMBIENT + (1.0 - AMBIENT) * BRIGHTNESS * cosine.abs()).min(1.1);
     let shine = 255.0 * GLOSS.0 * gloss.abs().powi(GLOSS.1);
     color.map(|channel| (f32::from(channel) * light + shine).min(255.0))
 }

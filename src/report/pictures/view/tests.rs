@@ -52,7 +52,7 @@ fn a_surface_shows_without_gaps_and_a_hole_shows_as_one() {
         &settings(),
     );
     // The bar at the right is coloured as well.
-    let columns = 400 - canvas::bar_width(300);
+    let columns = 400 - canvas::bar_width(canvas::text_height(300));
     let (all, rest) = (colored(&whole, columns), colored(&holed, columns));
     assert!(all > 15_000, "{all}");
     let hole = std::f64::consts::PI * 25.0 * 25.0 / (120.0 * 120.0);
