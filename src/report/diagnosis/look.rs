@@ -12,26 +12,36 @@ use crate::{
 const PIXELS: usize = 300_000;
 /// Beyond this many sigma a pixel is an outlier, as in the statistics of the decode.
 const OUTLIER_SIGMA: f64 = 5.0;
-/// A pixel this near to a stripe edge is not flat.
-const NEAR_EDGE: usize = 2;
+/// A pixel this near to a stripe edge is not flat. Three sigma of the blur of a usual chain of projector and camera: a
+/// response that is not linear spoils the pair sum as far as that.
+const NEAR_EDGE: usize = 6;
+/// Steps in which the way to `NEAR_EDGE` is looked at, short of the stripes.
+const EDGE_STEP: usize = 2;
 /// How many sigma apart P and Q must be to tell the bright frame.
 const BRIGHT_SIGMA: f64 = 8.0;
 /// A larger change of one frame's brightness is another picture.
 const LARGEST_CHANGE: f64 = 0.5;
+/// Spread up to which what a change of brightness leaves is noise: 1 by its definition, more where noise is estimated.
+const EXPLAINED_SIGMA: f64 = 1.5;
+/// Where the modulation is less than this many sigma, another picture might not show.
+const ABLE_SIGMA: f64 = 8.0;
+/// Fewer pixels than this show nothing.
+const LEAST_PIXELS: usize = 200;
 /// Without references, so many pairs are needed to tell a bad one from the others.
 const LEAST_PAIRS: usize = 4;
 /// Variance of the median of normal samples over that of their mean: pi / 2.
 const MEDIAN_VARIANCE: f64 = std::f64::consts::FRAC_PI_2;
-/// A torn frame is bad on this share of the pixels of one side of the tear: another pattern differs on half of them...
-const TORN_SIDE: f64 = 0.3;
+/// A torn frame is bad on this share of the pixels of one side of the tear (another pattern differs on half of them, and
+/// half-way to its edges not by much)...
+const TORN_SIDE: f64 = 0.15;
 /// ...where a row of the image is bad with this share of its pixels...
-const TORN_ROW: f64 = 0.15;
+const TORN_ROW: f64 = 0.08;
 /// ...and this share of the rows is bad: what moves seldom reaches from a side of the image to the tear...
 const TORN_ROWS_BAD: f64 = 0.8;
 /// ...sound on all but this share of the other side...
 const SOUND_SIDE: f64 = 0.02;
-/// ...and each side has this share of the rows.
-const TORN_ROWS: f64 = 0.05;
+/// ...and each side has this share of the rows: a strip that is free of stripes, or of things, at one end is no tear.
+const TORN_ROWS: f64 = 0.15;
 /// A row of the image counts with this many pixels looked at.
 const ROW_PIXELS: u32 = 16;
 
@@ -51,11 +61,13 @@ pub struct Frames<'a> {
 pub struct Look {
     /// Share of the pixels looked at that are outliers.
     pub outliers: f64,
-    /// The same after the brightness of each frame was allowed to differ.
+    /// The same after the change of brightness that explains most.
     pub unexplained: f64,
-    /// Change of the brightness of P and Q that explains most.
-    pub change: [f64; 2],
-    /// Median over the unexplained outliers of the residual as a share of the modulation: 1 for another picture.
+    /// Spread of what that change leaves, in units of the noise.
+    pub spread: f64,
+    /// The change, as a share of the light of a bright pixel.
+    pub change: f64,
+    /// Median over the outliers of the residual as a share of the modulation: 1 for another picture.
     pub strength: Option<f64>,
     /// First image row below a tear.
     pub torn_at: Option<usize>,
@@ -67,21 +79,26 @@ impl Look {
     /// Whether the frames differ in brightness from the others, and by nothing else.
     pub fn is_brightness(&self) -> bool {
         self.unexplained <= 0.1 * self.outliers
-            && self.change.iter().all(|change| change.abs() < LARGEST_CHANGE)
+            && self.spread <= EXPLAINED_SIGMA
+            && self.change.abs() < LARGEST_CHANGE
     }
 
-    /// Share of this pair's outliers that are outliers of `other` as well, among the pixels judged in both. Where
-    /// something moved the same pixels fail in all pairs; where frames show other patterns, other pixels fail in each.
-    pub fn overlap(&self, other: &Self) -> Option<f64> {
-        let (mut both, mut either) = (0, [0u64; 2]);
+    /// How far the outliers of this pair and of `other` are the same pixels: 1 where all are, 0 where as many are as
+    /// chance makes. Where something moved the same pixels fail in all pairs; where frames show other patterns, other
+    /// pixels fail in each.
+    pub fn same_pixels(&self, other: &Self) -> Option<f64> {
+        let (mut both, mut either, mut all) = (0u64, [0u64; 2], 0u64);
         for (one, two) in self.marks.iter().zip(&other.marks) {
             if let (Some(one), Some(two)) = (one, two) {
                 both += u64::from(*one && *two);
                 either[0] += u64::from(*one);
                 either[1] += u64::from(*two);
+                all += 1;
             }
         }
-        statistics::share(both, either[0].min(either[1]))
+        let found = statistics::share(both, either[0].min(either[1]))?;
+        let chance = statistics::share(either[0].max(either[1]), all)?;
+        statistics::finite((found - chance) / (1.0 - chance))
     }
 }
 
@@ -98,6 +115,11 @@ impl<'a> Frames<'a> {
         };
         let found = [self.of(bright), self.of(dark)];
         found.iter().all(|planes| !planes.is_empty()).then_some(found)
+    }
+
+    /// Whether there is something to compare pair sums with besides each other.
+    pub fn has_references(&self) -> bool {
+        self.references().is_some()
     }
 
     /// Both frames of all pairs.
@@ -123,7 +145,7 @@ impl<'a> Frames<'a> {
         if matches!(&expected, Expected::Pairs(pairs) if pairs.len() < LEAST_PAIRS) {
             return None;
         }
-        Some(Sampler { frames: self, pair, expected, flat_only }.look(axis == Axis::Row))
+        Sampler { frames: self, pair, expected, flat_only }.look()
     }
 
     /// Last less first modulation as a share of the modulation, median over the lit pixels.
@@ -176,13 +198,30 @@ impl Pixel {
         (apart.abs() > BRIGHT_SIGMA).then_some(usize::from(apart < 0.0))
     }
 
-    fn left(&self, change: [f64; 2]) -> f64 {
-        self.residual - change[0] * self.p - change[1] * self.q
+    /// Residual less what a change of brightness makes of it.
+    fn left(&self, change: Change) -> f64 {
+        match change {
+            Change::Gain([p, q]) => self.residual - p * self.p - q * self.q,
+            Change::Offset(offset) => self.residual - offset,
+        }
     }
 
-    fn is_outlier(&self, change: [f64; 2]) -> bool {
+    fn is_outlier(&self, change: Change) -> bool {
         self.left(change).abs() > OUTLIER_SIGMA * self.sigma
     }
+}
+
+/// A change of the light.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Change {
+    /// Of the lamp or the exposure, in proportion, of P and Q.
+    Gain([f64; 2]),
+    /// Of other light, in DN.
+    Offset(f64),
+}
+
+impl Change {
+    const NONE: Self = Self::Offset(0.0);
 }
 
 /// What a pair sum is compared with.
@@ -201,7 +240,7 @@ struct Sampler<'a, 'b> {
 }
 
 impl Sampler<'_, '_> {
-    fn look(&self, striped: bool) -> Look {
+    fn look(&self) -> Option<Look> {
         let class = &self.frames.decoded.class;
         let stride = (class.len() as f64 / PIXELS as f64).sqrt().ceil().max(1.0) as usize;
         let rows: Vec<usize> = (0..class.height()).step_by(stride).collect();
@@ -211,40 +250,54 @@ impl Sampler<'_, '_> {
             .flat_map(|&y| columns.iter().map(move |&x| (x, y)))
             .map(|(x, y)| self.pixel(x, y))
             .collect();
-        let change = [0, 1].map(|which| change(&pixels, which));
+        let seen: Vec<Pixel> = pixels.iter().flatten().copied().collect();
+        if seen.len() < LEAST_PIXELS {
+            return None;
+        }
+        let (change, spread) = explain(&seen)?;
         let marks: Vec<Option<bool>> =
             pixels.iter().map(|pixel| pixel.map(|pixel| pixel.is_outlier(change))).collect();
-        let count =
-            |of: &dyn Fn(&Pixel) -> bool| pixels.iter().flatten().filter(|pixel| of(pixel)).count() as u64;
-        let total = count(&|_| true);
-        let share = |of: &dyn Fn(&Pixel) -> bool| statistics::share(count(of), total).unwrap_or(0.0);
-        let mut strengths: Vec<f64> = pixels
-            .iter()
-            .flatten()
-            .filter(|pixel| pixel.is_outlier(change))
-            .filter_map(|pixel| statistics::finite((pixel.left(change) / pixel.modulation).abs()))
-            .collect();
+        let share = |change: Change| {
+            seen.iter().filter(|pixel| pixel.is_outlier(change)).count() as f64 / seen.len() as f64
+        };
+        let outliers = seen.iter().filter(|pixel| pixel.is_outlier(Change::NONE));
+        let strengths =
+            outliers.filter_map(|pixel| statistics::finite((pixel.residual / pixel.modulation).abs()));
         let by_row: Vec<[u32; 2]> = marks
             .chunks(columns.len().max(1))
             .map(|row| {
-                [row.iter().flatten().count() as u32, row.iter().flatten().filter(|bad| **bad).count() as u32]
+                let judged = row.iter().flatten();
+                [judged.clone().count() as u32, judged.filter(|bad| **bad).count() as u32]
             })
             .collect();
-        Look {
-            outliers: share(&|pixel| pixel.is_outlier([0.0; 2])),
-            unexplained: share(&|pixel| pixel.is_outlier(change)),
-            change,
-            strength: statistics::median(&mut strengths),
-            torn_at: tear(&by_row, striped).map(|row| rows[row]),
+        Some(Look {
+            outliers: share(Change::NONE),
+            unexplained: share(change),
+            spread,
+            change: match change {
+                Change::Gain([p, q]) => {
+                    if p.abs() > q.abs() {
+                        p
+                    } else {
+                        q
+                    }
+                }
+                Change::Offset(offset) => {
+                    let mut bright: Vec<f64> = seen.iter().map(|pixel| pixel.p.max(pixel.q)).collect();
+                    offset / statistics::median(&mut bright)?
+                }
+            },
+            strength: statistics::median(&mut strengths.collect::<Vec<_>>()),
+            torn_at: tear(&by_row).map(|row| rows[row]),
             marks,
-        }
+        })
     }
 
     fn pixel(&self, x: usize, y: usize) -> Option<Pixel> {
         let (decoded, settings) = (self.frames.decoded, self.frames.settings);
         let (width, height) = (decoded.class.width(), decoded.class.height());
         let at = y * width + x;
-        if !usable(decoded.class.data()[at]) || (self.flat_only && !self.is_flat(x, y, width, height)) {
+        if !usable(decoded.class.data()[at]) {
             return None;
         }
         let saturation = f64::from(settings.camera.saturation_dn);
@@ -272,35 +325,55 @@ impl Sampler<'_, '_> {
             }
         };
         let modulation = f64::from(decoded.modulation.data()[at]);
+        if modulation.abs() < ABLE_SIGMA * variance.sqrt() {
+            return None;
+        }
+        if self.flat_only
+            && !self.is_flat([x, y], [width, height], (2.0 * decoded.noise.variance(p.max(q))).sqrt())
+        {
+            return None;
+        }
         Some(Pixel { p, q, residual: p + q - expected, sigma: variance.sqrt(), modulation })
     }
 
-    /// Whether P and Q are in the same order all around.
-    fn is_flat(&self, x: usize, y: usize, width: usize, height: usize) -> bool {
-        let order =
-            |x: usize, y: usize| sample(self.pair[0], y * width + x) > sample(self.pair[1], y * width + x);
+    /// Whether P and Q are in the same order all around, or equal all around. `sigma`: noise of their difference.
+    fn is_flat(&self, [x, y]: [usize; 2], [width, height]: [usize; 2], sigma: f64) -> bool {
+        let order = |x: usize, y: usize| {
+            let at = y * width + x;
+            let apart = (sample(self.pair[0], at) - sample(self.pair[1], at)) / sigma;
+            if apart.abs() > BRIGHT_SIGMA { apart.signum() } else { 0.0 }
+        };
         let here = order(x, y);
-        order(x.saturating_sub(NEAR_EDGE), y) == here
-            && order((x + NEAR_EDGE).min(width - 1), y) == here
-            && order(x, y.saturating_sub(NEAR_EDGE)) == here
-            && order(x, (y + NEAR_EDGE).min(height - 1)) == here
+        (1..=NEAR_EDGE / EDGE_STEP).map(|step| step * EDGE_STEP).all(|off| {
+            order(x.saturating_sub(off), y) == here
+                && order((x + off).min(width - 1), y) == here
+                && order(x, y.saturating_sub(off)) == here
+                && order(x, (y + off).min(height - 1)) == here
+        })
     }
 }
 
-/// Change of brightness of frame `which` where it is the bright one.
-fn change(pixels: &[Option<Pixel>], which: usize) -> f64 {
-    let mut changes: Vec<f64> = pixels
-        .iter()
-        .flatten()
-        .filter(|pixel| pixel.bright() == Some(which))
-        .map(|pixel| pixel.residual / if which == 0 { pixel.p } else { pixel.q })
-        .collect();
-    statistics::median(&mut changes).and_then(statistics::finite).unwrap_or(0.0)
+/// The change of light that leaves the least spread, and that spread in units of the noise.
+fn explain(pixels: &[Pixel]) -> Option<(Change, f64)> {
+    let median = |values: &mut dyn Iterator<Item = f64>| {
+        statistics::median(&mut values.collect::<Vec<_>>()).and_then(statistics::finite).unwrap_or(0.0)
+    };
+    let gain = [0, 1].map(|which| {
+        let bright = pixels.iter().filter(|pixel| pixel.bright() == Some(which));
+        median(&mut bright.map(|pixel| pixel.residual / if which == 0 { pixel.p } else { pixel.q }))
+    });
+    let offset = median(&mut pixels.iter().map(|pixel| pixel.residual));
+    let spread = |change: Change| {
+        let mut left: Vec<f64> = pixels.iter().map(|pixel| pixel.left(change) / pixel.sigma).collect();
+        Some((change, statistics::robust_sigma(&mut left).and_then(statistics::finite)?))
+    };
+    let (by_gain, by_offset) = (spread(Change::Gain(gain))?, spread(Change::Offset(offset))?);
+    Some(if by_gain.1 <= by_offset.1 { by_gain } else { by_offset })
 }
 
-/// The row that parts a bad side from a sound one. `rows`: pixels looked at and outliers of each. `striped`: the pair
-/// codes rows, so that another pattern differs on whole bands of rows.
-fn tear(rows: &[[u32; 2]], striped: bool) -> Option<usize> {
+/// The row that parts a bad side from a sound one. `rows`: pixels looked at and outliers of each. A pair of rows that shows
+/// another pattern differs on bands; a tear in such a one counts as stale.
+fn tear(rows: &[[u32; 2]]) -> Option<usize> {
     let usable: Vec<(usize, f64)> = rows
         .iter()
         .enumerate()
@@ -311,7 +384,7 @@ fn tear(rows: &[[u32; 2]], striped: bool) -> Option<usize> {
     let least = ((usable.len() as f64 * TORN_ROWS).ceil() as usize).max(2);
     let is_whole = |side: &[(usize, f64)]| {
         let bad = side.iter().filter(|(_, share)| *share >= TORN_ROW).count();
-        striped || bad as f64 >= TORN_ROWS_BAD * side.len() as f64
+        bad as f64 >= TORN_ROWS_BAD * side.len() as f64
     };
     let mut above = 0.0;
     let mut best: Option<(f64, usize)> = None;
@@ -337,27 +410,22 @@ mod tests {
     #[test]
     fn a_tear_is_found_where_it_is() {
         let torn: Vec<[u32; 2]> = (0..48).map(|y| [60, if y < 30 { 33 } else { 0 }]).collect();
-        assert_eq!(tear(&torn, false), Some(30));
+        assert_eq!(tear(&torn), Some(30));
         let below: Vec<[u32; 2]> = (0..48).map(|y| [60, if y < 20 { 1 } else { 30 }]).collect();
-        assert_eq!(tear(&below, false), Some(20));
+        assert_eq!(tear(&below), Some(20));
     }
 
     #[test]
-    fn a_tear_of_rows_is_found_in_bands() {
+    fn a_blob_bands_a_whole_frame_and_a_sound_one_are_no_tear() {
+        let blob: Vec<[u32; 2]> = (0..48).map(|y| [60, if (10..30).contains(&y) { 30 } else { 0 }]).collect();
+        assert_eq!(tear(&blob), None);
         let bands: Vec<[u32; 2]> =
             (0..48).map(|y| [60, if y >= 24 && y / 4 % 2 == 0 { 60 } else { 0 }]).collect();
-        assert_eq!(tear(&bands, true), Some(24));
-        assert_eq!(tear(&bands, false), None);
-    }
-
-    #[test]
-    fn a_blob_a_whole_frame_and_a_sound_one_are_no_tear() {
-        let blob: Vec<[u32; 2]> = (0..48).map(|y| [60, if (10..30).contains(&y) { 30 } else { 0 }]).collect();
-        assert_eq!(tear(&blob, false), None);
-        assert_eq!(tear(&[[60, 30]; 48], false), None);
-        assert_eq!(tear(&[[60, 0]; 48], false), None);
+        assert_eq!(tear(&bands), None);
+        assert_eq!(tear(&[[60, 30]; 48]), None);
+        assert_eq!(tear(&[[60, 0]; 48]), None);
         // Rows with hardly a pixel say nothing.
-        assert_eq!(tear(&(0..48).map(|y| [5, if y < 24 { 5 } else { 0 }]).collect::<Vec<_>>(), false), None);
-        assert_eq!(tear(&[], false), None);
+        assert_eq!(tear(&(0..48).map(|y| [5, if y < 24 { 5 } else { 0 }]).collect::<Vec<_>>()), None);
+        assert_eq!(tear(&[]), None);
     }
 }

@@ -42,9 +42,15 @@ const STALE_SHARE: f64 = 0.5;
 const WHOLE_FRAME: f64 = 0.15;
 /// Share of the coarse pairs up to which a disturbance came and went.
 const FEW_PAIRS: f64 = 0.15;
-/// Share of a pair's bad pixels that are bad in the next pair as well, from which on something moved. Of pixels that are
-/// bad because a frame shows another pattern, a half is bad in another pair.
-const SAME_PIXELS: f64 = 0.7;
+/// How far the bad pixels of one pair are those of the next as well, 0 by chance and 1 for all, from which on something
+/// moved. Where frames show other patterns it is chance.
+const SAME_PIXELS: f64 = 0.4;
+/// Shift and spread of a pair that call for a closer look, in units of noise that was measured: where it was estimated,
+/// from 8-bit frames in particular, sound pairs reach them.
+const LOOK_SHIFT: f64 = 0.5;
+const LOOK_SIGMA: f64 = 1.25;
+/// Change of the light of single frames that is a reason, by the same measure as `DRIFT`.
+const CHANGE: f64 = 0.02;
 /// Correlation of the shifts with the order of the pairs from which on they are a drift rather than a flicker.
 const TREND: f64 = 0.8;
 /// Difference of first and last references, as a share of the modulation, from which on it is a reason: it moves a stripe
@@ -116,9 +122,9 @@ impl Case<'_> {
         let mut evidence = self.view.evidence();
         if let Some(look) = &self.look {
             evidence["look"] = json!({
-                "outliers": look.outliers, "unexplained_by_brightness": look.unexplained,
-                "brightness_change": look.change, "residual_share_of_modulation": look.strength,
-                "torn_at_row": look.torn_at,
+                "outliers": look.outliers, "brightness_change": look.change,
+                "unexplained_by_brightness": look.unexplained, "spread_unexplained": look.spread,
+                "residual_share_of_modulation": look.strength, "torn_at_row": look.torn_at,
             });
         }
         evidence
@@ -134,15 +140,16 @@ struct Sorted<'a> {
     disturbed: Vec<Case<'a>>,
 }
 
-fn sort<'a>(coarse: &[View<'a>], frames: Option<Frames>) -> Sorted<'a> {
+fn sort<'a>(coarse: &[View<'a>], frames: Option<Frames>, measured_noise: bool) -> Sorted<'a> {
     let mut sorted = Sorted::default();
     for &view in coarse {
+        let odd = view.shift.abs() > LOOK_SHIFT || view.sigma() > LOOK_SIGMA;
+        let conspicuous = view.is_disturbed() || view.is_shifted() || (measured_noise && odd);
         let close = |frames: Frames| frames.look(view.pair.axis, view.pair.bit, true);
-        let look = view.is_disturbed().then(|| frames.and_then(close)).flatten();
+        let look = conspicuous.then(|| frames.and_then(close)).flatten();
         let (brightness, disturbed) = match &look {
-            // What a statistic against bad references or bad other pairs made look bad.
-            Some(look) if look.outliers <= FLAT_OUTLIERS => (view.is_shifted(), false),
-            Some(look) => (look.is_brightness(), true),
+            Some(look) if look.is_brightness() => (look.change.abs() > CHANGE, false),
+            Some(look) => (false, look.unexplained > FLAT_OUTLIERS),
             None => (view.is_shifted(), view.is_disturbed()),
         };
         match (brightness, disturbed) {
@@ -161,14 +168,16 @@ pub fn diagnose(decoded: &Decoded, frames: Option<Frames>) -> Vec<Reason> {
     if coarse.is_empty() {
         coarse.clone_from(&views);
     }
-    let Sorted { sound, shifted, disturbed } = sort(&coarse, frames);
+    let Sorted { sound, shifted, disturbed } = sort(&coarse, frames, !decoded.noise_estimated);
 
     let mut reasons = Vec::new();
     reasons.extend(brightness(decoded, frames, &coarse, &shifted));
     if !disturbed.is_empty() {
         reasons.push(disturbance(&disturbed, coarse.len()));
-        // With pairs disturbed, what happens at edges and in fine stripes is no evidence of its own.
-        if 3 * sound.len() < coarse.len() {
+        // With pairs disturbed, what happens at edges and in fine stripes is no evidence of its own; nor where pairs are
+        // compared with each other for want of references.
+        let compared = frames.is_some_and(|frames| !frames.has_references());
+        if compared || 3 * sound.len() < coarse.len() {
             return reasons;
         }
     }
@@ -246,7 +255,7 @@ fn brightness(
     if shifted.is_empty() {
         return None;
     }
-    let change = |case: &Case| case.look.as_ref().map(|look| look.change[0].abs().max(look.change[1].abs()));
+    let change = |case: &Case| case.look.as_ref().map(|look| look.change.abs());
     let by = match shifted.iter().filter_map(change).max_by(f64::total_cmp) {
         Some(change) => format!("{:.1} %", 100.0 * change),
         None => {
@@ -328,13 +337,13 @@ fn disturbance(disturbed: &[Case], coarse: usize) -> Reason {
     }
     let share = disturbed.iter().map(Case::share).fold(0.0, f64::max);
     let looks: Vec<&Look> = disturbed.iter().filter_map(|case| case.look.as_ref()).collect();
-    let mut overlaps: Vec<f64> = looks.windows(2).filter_map(|pair| pair[0].overlap(pair[1])).collect();
-    let overlap = statistics::median(&mut overlaps);
+    let mut same: Vec<f64> = looks.windows(2).filter_map(|pair| pair[0].same_pixels(pair[1])).collect();
+    let same = statistics::median(&mut same);
     let mut strengths: Vec<f64> = disturbed.iter().filter_map(Case::strength).collect();
     let strength = statistics::median(&mut strengths);
     let mut evidence = all_evidence(disturbed);
-    evidence["same_pixels"] = json!(overlap);
-    let moved = overlap.map_or(share < WHOLE_FRAME, |overlap| overlap >= SAME_PIXELS);
+    evidence["same_pixels"] = json!(same);
+    let moved = same.map_or(share < WHOLE_FRAME, |same| same >= SAME_PIXELS);
     match strength {
         _ if moved => motion(disturbed, share, evidence),
         Some(rest) if rest < STALE_SHARE => Reason::degraded(
@@ -366,10 +375,10 @@ fn disturbance(disturbed: &[Case], coarse: usize) -> Reason {
 fn one_frame(disturbed: &[Case]) -> Reason {
     let share = disturbed.iter().map(Case::share).fold(0.0, f64::max);
     let worst = disturbed.iter().max_by(|a, b| a.share().total_cmp(&b.share()));
-    if let Some(row) = worst.and_then(|case| case.look.as_ref()?.torn_at) {
+    let by_modulation = worst.and_then(Case::strength).is_none_or(|strength| strength >= STALE_SHARE);
+    if let Some(row) = worst.and_then(|case| case.look.as_ref()?.torn_at).filter(|_| by_modulation) {
         return torn(disturbed, row);
     }
-    let by_modulation = worst.and_then(Case::strength).is_none_or(|strength| strength >= STALE_SHARE);
     match share >= WHOLE_FRAME && by_modulation {
         true => stale(disturbed, share),
         false => motion(disturbed, share, all_evidence(disturbed)),

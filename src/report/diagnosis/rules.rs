@@ -71,6 +71,8 @@ fn from_pixels(input: &ReportInput, decoded: &Decoded, pixels: &PixelCounts) -> 
         let follows = [
             Diagnosis::Flicker,
             Diagnosis::UnsettledDisplay,
+            Diagnosis::PolarizationInverted,
+            Diagnosis::PolarizationWeak,
             Diagnosis::SensorDefect,
             Diagnosis::LowCoverage,
         ];
