@@ -177,7 +177,7 @@ impl Camera for SimCamera {
         let region = self.region(settings.region)?;
         let exposure_us = (exposure / EXPOSURE_STEP_US).round() * EXPOSURE_STEP_US;
         let response = response(camera, settings, region, exposure_us);
-        let noise = (camera.gamma == 1.0).then(|| CameraNoise {
+        let noise = (camera.gamma == 1.0).then_some(CameraNoise {
             gain_dn_per_electron: response.dn_per_electron,
             read_noise_dn: camera.read_noise_e * response.dn_per_electron,
         });
