@@ -95,6 +95,7 @@ pub fn decode(args: &DecodeArgs) -> Result<u8, Failure> {
         frames: None,
     };
     let mut result = Manifest::new(&sequence, bundle.absolute_frames());
+    result.id = Some(results::new_id());
     result.label = manifest.label.clone();
     result.rig = manifest.rig.clone();
     result.settings = manifest.settings.clone();

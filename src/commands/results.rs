@@ -125,3 +125,9 @@ pub fn print(report: &Report, out: &Path, json: bool) {
     }
     print!("{}", report::summary(report, Some(Outputs { directory: out, files: &files })));
 }
+
+/// Time in milliseconds and the process: unique on a machine, and sorted by time.
+pub fn new_id() -> String {
+    let since = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).unwrap_or_default();
+    format!("{:012x}-{:x}", since.as_millis(), std::process::id())
+}

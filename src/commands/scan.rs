@@ -75,8 +75,7 @@ pub fn scan(settings: &Settings, regions: &[NamedRegion], out: &Path, json: bool
     bar.say("decoding");
 
     let mut manifest = Manifest::new(&sequence, FrameFiles::Npy(FRAMES_FILE_NAME.into()));
-    manifest.label = None;
-    manifest.id = Some(new_id());
+    manifest.id = Some(results::new_id());
     manifest.rig = Some(manifest::Rig {
         name: settings.raw.rig.name.clone(),
         camera: rig.camera.info().clone(),
@@ -247,12 +246,6 @@ fn calibration(
         Calibration::read_with(path, &hints).map_err(|error| Failure::data(operation(), error))?;
     calibrated.check_sizes(camera, projector).map_err(|error| Failure::data(operation(), error))?;
     Ok(Some(calibrated))
-}
-
-/// Time in milliseconds and the process: unique on a machine, and sorted by time.
-fn new_id() -> String {
-    let since = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).unwrap_or_default();
-    format!("{:012x}-{:x}", since.as_millis(), std::process::id())
 }
 
 fn device<T>(
