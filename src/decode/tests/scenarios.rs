@@ -162,7 +162,8 @@ fn exchanged_frames_of_a_pair_are_off_boundary() {
     // Few columns, so that the image holds boundaries of every bit.
     let coarse = Sequence::new(Mode::Pse, ProjectorSize { width: 64, height: 768 }).unwrap();
     let gentle = |x: f64, y: f64| Spot { u: 0.2 + 0.19 * x, v: 200.4 + 0.333 * y, ..Spot::default() };
-    for bit in 1..6 {
+    // Exchanging the finest pair moves codes by one column, which is within `snap_px`.
+    for bit in 1..5 {
         let mut frames = rig.scan(&gentle, &coarse);
         let p = frame_of(&mut frames, code(Axis::Column, bit, false)).clone();
         let q = std::mem::replace(frame_of(&mut frames, code(Axis::Column, bit, true)), p);
