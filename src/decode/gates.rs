@@ -25,6 +25,9 @@ use super::{
     words::{PixelMaps, WEAK_SCALE, WEAK_UNKNOWN},
 };
 
+/// Dissenting neighbours that outvote a single supporter: more than the four that the end of a line one pixel wide has
+/// where it meets the rim of the image.
+const DISSENTERS: usize = 5;
 /// How far a side's direction is followed, in px.
 const SLOPE_REACH: usize = 16;
 /// Illegal crossings that make a bit suspect, at least.
@@ -102,10 +105,10 @@ pub(crate) fn apply<T: Sync>(
                 continue;
             }
             let weakest = maps.weakest[y * width + x];
-            if weakest != WEAK_UNKNOWN && f32::from(weakest) < weak_below {
-                *class = Class::Interreflection;
-            } else if views.iter().any(|view| view.is_off_boundary(x, y)) {
+            if views.iter().any(|view| view.is_off_boundary(x, y)) {
                 *class = Class::OffBoundary;
+            } else if weakest != WEAK_UNKNOWN && f32::from(weakest) < weak_below {
+                *class = Class::Interreflection;
             }
         }
     });
@@ -283,7 +286,7 @@ impl AxisView<'_> {
     }
 }
 
-/// Whether too few of the eight neighbours support a pixel: none, or one against at least three that dissent.
+/// Whether too few of the eight neighbours support a pixel: none, or one against many that dissent.
 fn is_outvoted(class: &[Class], views: &[AxisView<'_>], x: usize, y: usize) -> bool {
     let Some(view) = views.first() else { return false };
     let (width, height) = (view.width, view.height);
@@ -308,5 +311,5 @@ fn is_outvoted(class: &[Class], views: &[AxisView<'_>], x: usize, y: usize) -> b
             }
         }
     }
-    supporters == 0 || (supporters == 1 && dissenters >= 3)
+    supporters == 0 || (supporters == 1 && dissenters >= DISSENTERS)
 }

@@ -7,6 +7,8 @@ mod accumulate;
 mod contrast;
 mod gates;
 mod noise;
+#[cfg(test)]
+mod oracle;
 mod pair_sum;
 mod plan;
 mod sample;
