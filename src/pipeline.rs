@@ -135,9 +135,12 @@ pub struct Context<'a> {
 /// The report of an outcome; `timings` adds what was measured outside.
 pub fn report(job: &Job, outcome: &Outcome, context: &Context, timings: Timings) -> Report {
     let size = Size { width: job.decode.width, height: job.decode.height };
+    let planes: Vec<_> =
+        job.roles.iter().copied().zip(job.planes.iter().map(|plane| plane.plane())).collect();
     let mut report = crate::report::build(&ReportInput {
         settings: Some(&job.decode),
         decoded: Some(&outcome.decoded),
+        planes: &planes,
         reconstruction: outcome.reconstruction.as_ref(),
         truth: context.truth,
         capture: context.capture,

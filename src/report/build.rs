@@ -1,6 +1,6 @@
 //! From results to the report. Pure.
 
-use polscan_patterns::Mode;
+use polscan_patterns::{Mode, Role};
 
 use super::{
     CaptureSummary, NamedRegion, Reason,
@@ -15,7 +15,7 @@ use super::{
 };
 use crate::{
     cloud::{Reconstruction, RowCheck, fit_plane},
-    decode::{Class, DecodeSettings, Decoded, PairResidual},
+    decode::{Class, DecodeSettings, Decoded, PairResidual, Plane},
     geometry::Quality,
     grid::Grid,
     truth::Truth,
@@ -48,9 +48,8 @@ pub struct ReportInput<'a> {
     pub regions: &'a [NamedRegion],
     /// Calibration that was used.
     pub calibration: Option<CalibrationReport>,
-    /// Last minus first modulation as a share of the modulation, median over lit pixels, where both are known: lamp and
-    /// exposure change it, other light in the room does not.
-    pub modulation_drift: Option<f64>,
+    /// The frames themselves, for a closer look at pairs that do not add up; may be empty.
+    pub planes: &'a [(Role, Plane<'a>)],
     /// Where the time went.
     pub timings: Timings,
     /// Threads of the compute pool.
@@ -75,7 +74,7 @@ impl<'a> ReportInput<'a> {
             contrast: None,
             regions: &[],
             calibration: None,
-            modulation_drift: None,
+            planes: &[],
             timings: Timings::default(),
             threads: 1,
             simulated: false,

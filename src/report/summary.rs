@@ -108,7 +108,7 @@ fn capture(text: &mut Text, report: &Report) {
         text.entry(
             "light check",
             &format!(
-                "{:.2} x the camera's noise (1.00 is ideal), worst {:.2}: {} bit {}",
+                "{:.2} x the camera's noise (ideal 1.00), worst {:.2}: {} bit {}",
                 residual.median, residual.worst, residual.worst_pair.axis, residual.worst_pair.bit
             ),
         );
@@ -260,7 +260,7 @@ scan          mode pse, 44 frames of 160 x 120 px
 coverage      100.0 % of 19 200 pixels with projector light were measured
 points        19 200
 capture       1.50 s; the display allows no less than 1.47 s
-light check   1.00 x the camera's noise (1.00 is ideal), worst 1.00: row bit 9
+light check   1.00 x the camera's noise (ideal 1.00), worst 1.00: row bit 9
 drift         +0.00 % between the first and the last frames
 flatness      mm             points measured      rms     95 %      bow
               table top         936  100.0 %    0.000    0.000    0.000

@@ -4,4 +4,4 @@ mod captures;
 mod exact;
 mod scenarios;
 mod simulated;
-mod synth;
+pub(crate) mod synth;

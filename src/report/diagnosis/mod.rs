@@ -4,7 +4,7 @@
 //! reason at all; what is merely worth knowing is a note of the report.
 
 mod captured;
-mod field;
+mod look;
 mod order;
 mod pairs;
 mod rules;

@@ -7,7 +7,10 @@
 use polscan_patterns::Axis;
 use serde_json::{Value, json};
 
-use super::{Diagnosis, Reason, field, field::Field};
+use super::{
+    Diagnosis, Reason,
+    look::{Frames, Look},
+};
 use crate::{
     decode::{Decoded, PairResidual},
     report::statistics,
@@ -39,8 +42,9 @@ const STALE_SHARE: f64 = 0.5;
 const WHOLE_FRAME: f64 = 0.15;
 /// Share of the coarse pairs up to which a disturbance came and went.
 const FEW_PAIRS: f64 = 0.15;
-/// Share of the lit pixels from which on a disturbance of many pairs is everywhere rather than somewhere.
-const EVERYWHERE: f64 = 0.3;
+/// Share of a pair's bad pixels that are bad in the next pair as well, from which on something moved. Of pixels that are
+/// bad because a frame shows another pattern, a half is bad in another pair.
+const SAME_PIXELS: f64 = 0.7;
 /// Correlation of the shifts with the order of the pairs from which on they are a drift rather than a flicker.
 const TREND: f64 = 0.8;
 /// Difference of first and last references, as a share of the modulation, from which on it is a reason: it moves a stripe
@@ -81,11 +85,10 @@ impl View<'_> {
         })
     }
 
-    /// Whether all pixels moved alike, as when the light changes, and by less than another picture would do.
-    fn is_shifted(&self, modulation: Option<f64>) -> bool {
+    /// Whether the pixels moved as one, by the statistics of the pair alone.
+    fn is_shifted(&self) -> bool {
         let precise = 5.0 * 1.2533 * self.sigma().max(1.0) / (self.pair.pixels.max(1) as f64).sqrt();
         self.shift.abs() > SHIFT_SIGMA.max(precise)
-            && modulation.is_none_or(|modulation| self.shift.abs() < STALE_SHARE * modulation)
             && (!self.is_disturbed() || self.shift.abs() >= self.sigma())
     }
 
@@ -94,43 +97,94 @@ impl View<'_> {
     }
 }
 
-/// All reasons that the pair sums give.
-pub fn diagnose(decoded: &Decoded, modulation_drift: Option<f64>) -> Vec<Reason> {
+/// A coarse pair that does not add up, with a closer look at it where there are frames to look at.
+struct Case<'a> {
+    view: View<'a>,
+    look: Option<Look>,
+}
+
+impl Case<'_> {
+    fn share(&self) -> f64 {
+        self.look.as_ref().map_or(self.view.outliers(), |look| look.unexplained)
+    }
+
+    fn strength(&self) -> Option<f64> {
+        self.look.as_ref().and_then(|look| look.strength)
+    }
+
+    fn evidence(&self) -> Value {
+        let mut evidence = self.view.evidence();
+        if let Some(look) = &self.look {
+            evidence["look"] = json!({
+                "outliers": look.outliers, "unexplained_by_brightness": look.unexplained,
+                "brightness_change": look.change, "residual_share_of_modulation": look.strength,
+                "torn_at_row": look.torn_at,
+            });
+        }
+        evidence
+    }
+}
+
+/// The coarse pairs by what is wrong with them.
+#[derive(Default)]
+struct Sorted<'a> {
+    sound: Vec<View<'a>>,
+    /// Another brightness, and nothing else.
+    shifted: Vec<Case<'a>>,
+    disturbed: Vec<Case<'a>>,
+}
+
+fn sort<'a>(coarse: &[View<'a>], frames: Option<Frames>) -> Sorted<'a> {
+    let mut sorted = Sorted::default();
+    for &view in coarse {
+        let close = |frames: Frames| frames.look(view.pair.axis, view.pair.bit, true);
+        let look = view.is_disturbed().then(|| frames.and_then(close)).flatten();
+        let (brightness, disturbed) = match &look {
+            // What a statistic against bad references or bad other pairs made look bad.
+            Some(look) if look.outliers <= FLAT_OUTLIERS => (view.is_shifted(), false),
+            Some(look) => (look.is_brightness(), true),
+            None => (view.is_shifted(), view.is_disturbed()),
+        };
+        match (brightness, disturbed) {
+            (true, _) => sorted.shifted.push(Case { view, look }),
+            (_, true) => sorted.disturbed.push(Case { view, look }),
+            (false, false) => sorted.sound.push(view),
+        }
+    }
+    sorted
+}
+
+/// All reasons that the pair sums give. `frames` allow a closer look at pairs that fail.
+pub fn diagnose(decoded: &Decoded, frames: Option<Frames>) -> Vec<Reason> {
     let views = views(&decoded.pairs);
     let (fine, mut coarse): (Vec<View>, Vec<View>) = views.iter().partition(|view| view.rank < FINE_RANKS);
     if coarse.is_empty() {
         coarse.clone_from(&views);
     }
-    let modulation = field::modulation_sigma(decoded);
-    let (shifted, rest): (Vec<View>, Vec<View>) = coarse.iter().partition(|view| view.is_shifted(modulation));
-    let (disturbed, sound): (Vec<View>, Vec<View>) = rest.iter().partition(|view| view.is_disturbed());
+    let Sorted { sound, shifted, disturbed } = sort(&coarse, frames);
 
     let mut reasons = Vec::new();
-    reasons.extend(brightness(decoded, modulation_drift, &coarse, &shifted));
+    reasons.extend(brightness(decoded, frames, &coarse, &shifted));
     if !disturbed.is_empty() {
-        let found = survey(decoded, &disturbed);
-        reasons.push(disturbance(&disturbed, coarse.len(), found));
+        reasons.push(disturbance(&disturbed, coarse.len()));
+        // With pairs disturbed, what happens at edges and in fine stripes is no evidence of its own.
+        if 3 * sound.len() < coarse.len() {
+            return reasons;
+        }
     }
-    match lone(&fine, modulation) {
+    match lone(&fine) {
         Some(view) if disturbed.is_empty() => {
-            let found = survey(decoded, &[view]);
-            reasons.push(one_frame(&[view], found));
+            let look = frames.and_then(|frames| frames.look(view.pair.axis, view.pair.bit, false));
+            reasons.push(fine_frame(&Case { view, look }));
         }
         Some(_) => {}
-        // With most pairs disturbed, what happens at edges is no evidence of its own.
-        None if 3 * sound.len() >= coarse.len() => {
+        None => {
             // Light that changes shifts fine pairs as it does coarse ones.
             let fine = if shifted.is_empty() { &fine[..] } else { &[] };
             reasons.extend(nonlinear(&sound, fine));
         }
-        None => {}
     }
     reasons
-}
-
-fn survey(decoded: &Decoded, disturbed: &[View]) -> Field {
-    let striped = disturbed.iter().all(|view| view.pair.axis == Axis::Row);
-    field::survey(decoded, disturbed.len(), striped)
 }
 
 fn views(pairs: &[PairResidual]) -> Vec<View<'_>> {
@@ -156,11 +210,13 @@ fn views(pairs: &[PairResidual]) -> Vec<View<'_>> {
     views
 }
 
-fn names(views: &[View]) -> String {
-    match views {
-        [one] => format!("pair {}", one.name()),
-        [one, other] => format!("pairs {} and {}", one.name(), other.name()),
-        [one, .., last] => format!("{} pairs from {} to {}", views.len(), one.name(), last.name()),
+fn names(cases: &[Case]) -> String {
+    match cases {
+        [one] => format!("pair {}", one.view.name()),
+        [one, other] => format!("pairs {} and {}", one.view.name(), other.view.name()),
+        [one, .., last] => {
+            format!("{} pairs from {} to {}", cases.len(), one.view.name(), last.view.name())
+        }
         [] => "no pair".to_owned(),
     }
 }
@@ -169,45 +225,60 @@ fn worst<'a>(views: &[View<'a>], by: impl Fn(&View) -> f64) -> Option<View<'a>> 
     views.iter().copied().max_by(|a, b| by(a).total_cmp(&by(b)))
 }
 
-fn all_evidence(views: &[View]) -> Vec<Value> {
-    views.iter().map(View::evidence).collect()
+fn all_evidence(cases: &[Case]) -> Value {
+    json!({ "pairs": cases.iter().map(Case::evidence).collect::<Vec<_>>() })
 }
 
-/// Light that changed for all pixels alike.
+/// Light that changed.
 fn brightness(
     decoded: &Decoded,
-    modulation_drift: Option<f64>,
+    frames: Option<Frames>,
     coarse: &[View],
-    shifted: &[View],
+    shifted: &[Case],
 ) -> Option<Reason> {
     let trend = trend(coarse);
     let drift = decoded.drift.and_then(statistics::finite);
     let drifted = drift.is_some_and(|drift| drift.abs() > DRIFT);
     if drifted || (!shifted.is_empty() && trend.abs() >= TREND) {
-        return Some(drift_reason(drift, modulation_drift, trend, shifted));
+        let modulation = frames.and_then(|frames| frames.modulation_drift());
+        return Some(drift_reason(drift, modulation, trend, shifted));
     }
-    let largest = worst(shifted, |view| view.shift.abs())?;
+    if shifted.is_empty() {
+        return None;
+    }
+    let change = |case: &Case| case.look.as_ref().map(|look| look.change[0].abs().max(look.change[1].abs()));
+    let by = match shifted.iter().filter_map(change).max_by(f64::total_cmp) {
+        Some(change) => format!("{:.1} %", 100.0 * change),
+        None => {
+            let shifts = shifted.iter().map(|case| case.view.shift.abs());
+            format!("{:.1} times the noise", shifts.fold(0.0, f64::max))
+        }
+    };
+    let mut evidence = all_evidence(shifted);
+    evidence["trend"] = json!(trend);
     Some(Reason::degraded(
         Diagnosis::Flicker,
         format!(
-            "the light of {} differs from that of the other frames by up to {:.1} times the noise, to and fro rather \
-             than steadily; the lamp or the room's light flickers faster than a scan takes: choose an exposure of \
-             whole periods of the mains (10 or 20 ms at 50 Hz) or of the projector's refresh, and shade the scene",
+            "the light of {} differs from that of the other frames by up to {by}, to and fro rather than steadily; the \
+             lamp or the room's light flickers faster than a scan takes: choose an exposure of whole periods of the mains \
+             (10 or 20 ms at 50 Hz) or of the projector's refresh, and shade the scene",
             names(shifted),
-            largest.shift.abs(),
         ),
-        json!({ "pairs": all_evidence(shifted), "largest_shift_sigma": largest.shift, "trend": trend }),
+        evidence,
     ))
 }
 
-fn drift_reason(drift: Option<f64>, modulation: Option<f64>, trend: f64, shifted: &[View]) -> Reason {
+fn drift_reason(drift: Option<f64>, modulation: Option<f64>, trend: f64, shifted: &[Case]) -> Reason {
     let seen = match drift {
         Some(drift) => {
             format!("the last references differ from the first by {:+.1} % of the modulation", 100.0 * drift)
         }
         None => format!("the light changed steadily over {}", names(shifted)),
     };
-    let evidence = json!({ "drift": drift, "modulation_drift": modulation, "trend": trend, "pairs": all_evidence(shifted) });
+    let mut evidence = all_evidence(shifted);
+    evidence["drift"] = json!(drift);
+    evidence["modulation_drift"] = json!(modulation);
+    evidence["trend"] = json!(trend);
     let lamp = drift.zip(modulation).map(|(drift, modulation)| modulation.abs() >= LAMP_SHARE * drift.abs());
     if lamp == Some(false) {
         return Reason::degraded(
@@ -251,25 +322,29 @@ fn trend(coarse: &[View]) -> f64 {
 }
 
 /// Pixels that do not fit together on flat areas.
-fn disturbance(disturbed: &[View], coarse: usize, found: Field) -> Reason {
+fn disturbance(disturbed: &[Case], coarse: usize) -> Reason {
     if disturbed.len() as f64 <= (FEW_PAIRS * coarse as f64).max(2.0) {
-        return one_frame(disturbed, found);
+        return one_frame(disturbed);
     }
-    let share = worst(disturbed, |view| view.flat).map_or(0.0, |view| view.flat);
-    let evidence = evidence_of(disturbed, found);
-    if found.affected < EVERYWHERE {
-        return motion(disturbed, share, evidence);
-    }
-    match found.relative {
-        Some(relative) if relative < STALE_SHARE => Reason::degraded(
+    let share = disturbed.iter().map(Case::share).fold(0.0, f64::max);
+    let looks: Vec<&Look> = disturbed.iter().filter_map(|case| case.look.as_ref()).collect();
+    let mut overlaps: Vec<f64> = looks.windows(2).filter_map(|pair| pair[0].overlap(pair[1])).collect();
+    let overlap = statistics::median(&mut overlaps);
+    let mut strengths: Vec<f64> = disturbed.iter().filter_map(Case::strength).collect();
+    let strength = statistics::median(&mut strengths);
+    let mut evidence = all_evidence(disturbed);
+    evidence["same_pixels"] = json!(overlap);
+    let moved = overlap.map_or(share < WHOLE_FRAME, |overlap| overlap >= SAME_PIXELS);
+    match strength {
+        _ if moved => motion(disturbed, share, evidence),
+        Some(rest) if rest < STALE_SHARE => Reason::degraded(
             Diagnosis::UnsettledDisplay,
             format!(
                 "in {} the frames do not add up to the references: a rest of about {:.0} % of the picture before is \
                  still on the glass; the display had not settled: run `polscan calibrate sync`, or hold each picture \
                  for one refresh more",
                 names(disturbed),
-                // A pixel differs from the picture before in a half of the pairs.
-                100.0 * relative * std::f64::consts::SQRT_2,
+                100.0 * rest,
             ),
             evidence,
         ),
@@ -287,45 +362,55 @@ fn disturbance(disturbed: &[View], coarse: usize, found: Field) -> Reason {
     }
 }
 
-fn evidence_of(views: &[View], found: Field) -> Value {
-    json!({
-        "pairs": all_evidence(views), "affected_share": found.affected,
-        "residual_share_of_modulation": found.relative, "torn_at_row": found.torn_at,
-    })
+/// A disturbance of one pair or two.
+fn one_frame(disturbed: &[Case]) -> Reason {
+    let share = disturbed.iter().map(Case::share).fold(0.0, f64::max);
+    let worst = disturbed.iter().max_by(|a, b| a.share().total_cmp(&b.share()));
+    if let Some(row) = worst.and_then(|case| case.look.as_ref()?.torn_at) {
+        return torn(disturbed, row);
+    }
+    let by_modulation = worst.and_then(Case::strength).is_none_or(|strength| strength >= STALE_SHARE);
+    match share >= WHOLE_FRAME && by_modulation {
+        true => stale(disturbed, share),
+        false => motion(disturbed, share, all_evidence(disturbed)),
+    }
 }
 
-/// A disturbance of one pair or two.
-fn one_frame(disturbed: &[View], found: Field) -> Reason {
-    let share = worst(disturbed, |view| view.outliers()).map_or(0.0, |view| view.outliers());
-    let evidence = evidence_of(disturbed, found);
-    let names = names(disturbed);
-    let by_modulation = found.relative.is_none_or(|relative| relative >= STALE_SHARE);
-    if let Some(row) = found.torn_at.filter(|_| by_modulation) {
-        return Reason::failed(
-            Diagnosis::TornFrame,
-            format!(
-                "in {names} the image is sound on one side of row {row} and wrong on the other; the frame was exposed \
-                 while the picture changed: switch vertical sync on, run `polscan calibrate sync`, and scan again"
-            ),
-            evidence,
-        );
+/// A disturbance of a fine pair alone: blur takes its residual's strength, and motion would not spare the others.
+fn fine_frame(case: &Case) -> Reason {
+    match case.look.as_ref().and_then(|look| look.torn_at) {
+        Some(row) => torn(std::slice::from_ref(case), row),
+        None => stale(std::slice::from_ref(case), case.view.outliers()),
     }
-    if share < WHOLE_FRAME || !by_modulation {
-        return motion(disturbed, share, evidence);
-    }
+}
+
+fn torn(disturbed: &[Case], row: usize) -> Reason {
     Reason::failed(
-        Diagnosis::StaleFrame,
+        Diagnosis::TornFrame,
         format!(
-            "in {names} {:.0} % of the pixels do not add up to the references, by as much as another picture would \
-             make; one of its frames shows the picture before: run `polscan calibrate sync`, or raise \
-             the delay from flip to trigger, and scan again",
-            100.0 * share,
+            "in {} the image is sound on one side of row {row} and wrong on the other; the frame was exposed while the \
+             picture changed: switch vertical sync on, run `polscan calibrate sync`, and scan again",
+            names(disturbed),
         ),
-        evidence,
+        all_evidence(disturbed),
     )
 }
 
-fn motion(disturbed: &[View], share: f64, evidence: Value) -> Reason {
+fn stale(disturbed: &[Case], share: f64) -> Reason {
+    Reason::failed(
+        Diagnosis::StaleFrame,
+        format!(
+            "in {} {:.0} % of the pixels do not add up to the references, by as much as another picture would make; one \
+             of its frames shows the picture before: run `polscan calibrate sync`, or raise the delay from flip to \
+             trigger, and scan again",
+            names(disturbed),
+            100.0 * share,
+        ),
+        all_evidence(disturbed),
+    )
+}
+
+fn motion(disturbed: &[Case], share: f64, evidence: Value) -> Reason {
     let message = format!(
         "in {} up to {:.1} % of the flat pixels do not add up to the references, in a part of the image; something \
          moved there during the capture: hold object, camera and projector still, and scan again",
@@ -340,14 +425,12 @@ fn motion(disturbed: &[View], share: f64, evidence: Value) -> Reason {
 }
 
 /// A fine pair that is bad while all other fine ones are sound: no matter of the response, which spoils all of them.
-fn lone<'a>(fine: &[View<'a>], modulation: Option<f64>) -> Option<View<'a>> {
+fn lone<'a>(fine: &[View<'a>]) -> Option<View<'a>> {
     let bad = worst(fine, |view| view.outliers()).filter(|view| view.outliers() > LONE_OUTLIERS)?;
-    let others = fine.iter().filter(|view| !std::ptr::eq(view.pair, bad.pair));
-    let alone = fine.len() > 1 && others.clone().all(|view| view.outliers() < SOUND_OUTLIERS);
-    let strong = modulation
-        .is_none_or(|modulation| bad.sigma().max(bad.shift.abs()) >= 0.5 * STALE_SHARE * modulation);
-    // A stale frame may be off by the modulation both ways and not at all on half of the pixels.
-    (alone && (strong || bad.shift.abs() < SHIFT_SIGMA)).then_some(bad)
+    let mut others = fine.iter().filter(|view| !std::ptr::eq(view.pair, bad.pair));
+    // Of one axis alone the finest pair may be the only one that crosstalk spoils so much.
+    let comparable = fine.iter().any(|view| view.pair.axis != bad.pair.axis) || bad.rank > 0;
+    (comparable && others.all(|view| view.outliers() < SOUND_OUTLIERS)).then_some(bad)
 }
 
 /// A response that is not linear shows at stripe edges, or in the finest stripes, which have nothing else.
@@ -384,271 +467,9 @@ fn nonlinear(sound: &[View], fine: &[View]) -> Option<Reason> {
         ),
         json!({
             "edge_outliers": edges, "flat_outliers": worst(sound, |view| view.flat).map(|view| view.flat),
-            "finest_pairs": all_evidence(&finest),
+            "finest_pairs": finest.iter().map(View::evidence).collect::<Vec<_>>(),
         }),
     ))
 }
-
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::report::{Verdict, testing};
-
-    /// A sound decode, spoilt; then the diagnoses with their severities.
-    fn found(spoil: impl FnOnce(&mut Decoded)) -> Vec<(Diagnosis, Verdict)> {
-        found_with(None, spoil)
-    }
-
-    fn found_with(
-        modulation_drift: Option<f64>,
-        spoil: impl FnOnce(&mut Decoded),
-    ) -> Vec<(Diagnosis, Verdict)> {
-        let mut decoded = testing::decoded(64, 48);
-        spoil(&mut decoded);
-        let reasons = diagnose(&decoded, modulation_drift);
-        for reason in &reasons {
-            assert!(reason.message.len() > 60 && reason.evidence.is_object(), "{reason:?}");
-        }
-        reasons.into_iter().map(|reason| (reason.diagnosis, reason.severity)).collect()
-    }
-
-    const PAIRS: f64 = 20.0;
-
-    /// Root mean square over all pairs of a residual of `share` of the modulation in `bad` pairs and noise in all.
-    fn residual(decoded: &Decoded, share: f64, bad: f64) -> f32 {
-        let amplitude = share * field::modulation_sigma(decoded).unwrap();
-        ((bad * amplitude * amplitude + PAIRS) / PAIRS).sqrt() as f32
-    }
-
-    /// Sets the residual where `place` says so.
-    fn spread(decoded: &mut Decoded, value: f32, place: impl Fn(usize, usize) -> bool) {
-        let width = decoded.residual.width();
-        for (index, residual) in decoded.residual.data_mut().iter_mut().enumerate() {
-            if place(index % width, index / width) {
-                *residual = value;
-            }
-        }
-    }
-
-    #[test]
-    fn noise_is_no_reason() {
-        assert_eq!(found(|_| {}), []);
-    }
-
-    #[test]
-    fn what_sound_captures_of_real_cameras_show_is_no_reason() {
-        // 8-bit frames round all pairs down alike by half a sigma, a few pixels glitter.
-        let medians = [0.0, -0.26, -0.27, -0.29, -0.36, -0.5, -0.53, -0.56, -0.56, -0.85];
-        assert_eq!(
-            found(|decoded| for pair in &mut decoded.pairs {
-                pair.median = medians[usize::from(pair.bit)];
-                pair.sigma = 0.9;
-                pair.flat_outliers = 0.0002;
-                pair.edge_outliers = 0.0005;
-            }),
-            []
-        );
-    }
-
-    #[test]
-    fn no_pairs_give_no_reasons() {
-        assert_eq!(found(|decoded| decoded.pairs.clear()), []);
-        assert_eq!(
-            found(|decoded| for pair in &mut decoded.pairs {
-                (pair.sigma, pair.median) = (f64::NAN, f64::NAN);
-                (pair.flat_outliers, pair.edge_outliers, pair.pixels) = (f64::NAN, f64::NAN, 0);
-            }),
-            []
-        );
-    }
-
-    /// Shares of pixels at edges beyond 5 sigma, and medians, as a real projector with a gamma showed them.
-    #[test]
-    fn a_gamma_is_a_nonlinear_response() {
-        let edges = [0.07, 0.08, 0.21, 0.06, 0.08, 0.12, 0.13, 0.17, 0.43, 0.90];
-        let gamma = |decoded: &mut Decoded| {
-            for pair in &mut decoded.pairs {
-                pair.edge_outliers = edges[usize::from(pair.bit)];
-                if pair.bit == 9 {
-                    (pair.sigma, pair.median, pair.flat_outliers) = (3.1, -15.4, 0.28);
-                }
-                if pair.bit == 8 {
-                    (pair.sigma, pair.median, pair.flat_outliers) = (3.2, -4.1, 0.01);
-                }
-            }
-        };
-        assert_eq!(found(gamma), [(Diagnosis::NonlinearResponse, Verdict::Degraded)]);
-        assert_eq!(
-            found(|decoded| {
-                gamma(decoded);
-                decoded.pairs.retain(|pair| pair.axis == Axis::Column);
-            }),
-            [(Diagnosis::NonlinearResponse, Verdict::Degraded)]
-        );
-    }
-
-    #[test]
-    fn crosstalk_of_the_finest_stripes_alone_is_a_nonlinear_response() {
-        let crosstalk = |decoded: &mut Decoded| {
-            for pair in decoded.pairs.iter_mut().filter(|pair| pair.bit == 9) {
-                (pair.median, pair.edge_outliers) = (-6.0, 0.6);
-            }
-        };
-        assert_eq!(found(crosstalk), [(Diagnosis::NonlinearResponse, Verdict::Degraded)]);
-    }
-
-    /// An inverse that shows its own pattern again: the sum is off by the whole modulation, up or down.
-    fn repeat(decoded: &mut Decoded, bit: usize) {
-        let modulation = field::modulation_sigma(decoded).unwrap();
-        let pair = &mut decoded.pairs[bit];
-        (pair.sigma, pair.median, pair.flat_outliers) = (1.48 * modulation, 0.9 * modulation, 1.0);
-        pair.edge_outliers = 0.9;
-        let value = residual(decoded, 1.0, 1.0);
-        spread(decoded, value, |_, _| true);
-    }
-
-    #[test]
-    fn a_frame_of_another_picture_is_stale() {
-        for bit in 0..10 {
-            assert_eq!(
-                found(|decoded| repeat(decoded, bit)),
-                [(Diagnosis::StaleFrame, Verdict::Failed)],
-                "{bit}"
-            );
-        }
-        // The inverse of the bit before: half of the pixels agree by chance, the others are off either way.
-        for bit in 1..10 {
-            let half = |decoded: &mut Decoded| {
-                let pair = &mut decoded.pairs[bit];
-                (pair.sigma, pair.flat_outliers, pair.edge_outliers) = (1.4, 0.5, 0.5);
-                let value = residual(decoded, 1.0, 1.0);
-                spread(decoded, value, |x, _| x % 4 < 2);
-            };
-            assert_eq!(found(half), [(Diagnosis::StaleFrame, Verdict::Failed)], "{bit}");
-        }
-    }
-
-    #[test]
-    fn a_shift_as_large_as_the_modulation_is_no_flicker() {
-        // Where the pattern is nearly uniform over what the camera sees, a stale frame moves all pixels one way.
-        let uniform = |decoded: &mut Decoded| {
-            repeat(decoded, 0);
-            decoded.pairs[0].sigma = 1.2;
-        };
-        assert_eq!(found(uniform), [(Diagnosis::StaleFrame, Verdict::Failed)]);
-    }
-
-    #[test]
-    fn a_whole_sequence_one_frame_late_is_stale() {
-        let late = |decoded: &mut Decoded| {
-            for pair in &mut decoded.pairs {
-                (pair.sigma, pair.flat_outliers, pair.edge_outliers) = (1.4, 0.5, 0.5);
-            }
-            let value = residual(decoded, 1.0, PAIRS / 2.0);
-            spread(decoded, value, |_, _| true);
-        };
-        assert_eq!(found(late), [(Diagnosis::StaleFrame, Verdict::Failed)]);
-    }
-
-    #[test]
-    fn a_rest_of_the_picture_before_is_an_unsettled_display() {
-        let unsettled = |decoded: &mut Decoded| {
-            for pair in &mut decoded.pairs {
-                (pair.sigma, pair.flat_outliers, pair.edge_outliers) = (1.4, 0.4, 0.4);
-            }
-            let value = residual(decoded, 0.2, PAIRS / 2.0);
-            spread(decoded, value, |_, _| true);
-        };
-        assert_eq!(found(unsettled), [(Diagnosis::UnsettledDisplay, Verdict::Degraded)]);
-    }
-
-    #[test]
-    fn a_frame_of_two_pictures_is_torn() {
-        for bit in [2, 8] {
-            let torn = |decoded: &mut Decoded| {
-                let pair = &mut decoded.pairs[bit];
-                (pair.flat_outliers, pair.edge_outliers) = (0.35, 0.35);
-                let value = residual(decoded, 1.0, 1.0);
-                spread(decoded, value, |_, y| y >= 31);
-            };
-            assert_eq!(found(torn), [(Diagnosis::TornFrame, Verdict::Failed)], "{bit}");
-        }
-    }
-
-    #[test]
-    fn a_part_of_the_image_that_fails_in_many_pairs_moved() {
-        let moved = |share: f64| {
-            found(move |decoded| {
-                for pair in decoded.pairs.iter_mut().filter(|pair| pair.axis == Axis::Row) {
-                    (pair.flat_outliers, pair.edge_outliers) = (share, share);
-                }
-                let value = residual(decoded, 0.6, 10.0);
-                spread(decoded, value, |x, y| (10..30).contains(&x) && (10..30).contains(&y));
-            })
-        };
-        assert_eq!(moved(0.13), [(Diagnosis::Motion, Verdict::Degraded)]);
-        assert_eq!(moved(0.6), [(Diagnosis::Motion, Verdict::Failed)]);
-        assert_eq!(moved(0.0015), []);
-    }
-
-    #[test]
-    fn a_part_of_the_image_that_fails_in_one_pair_moved_through() {
-        let passed = |decoded: &mut Decoded| {
-            decoded.pairs[3].flat_outliers = 0.1;
-            let value = residual(decoded, 0.6, 1.0);
-            spread(decoded, value, |x, y| (10..30).contains(&x) && (10..30).contains(&y));
-        };
-        assert_eq!(found(passed), [(Diagnosis::Motion, Verdict::Degraded)]);
-    }
-
-    #[test]
-    fn a_handful_of_pixels_is_no_evidence() {
-        assert_eq!(
-            found(|decoded| {
-                decoded.pairs[3].flat_outliers = 0.01;
-                decoded.pairs[3].pixels = 1900;
-            }),
-            []
-        );
-    }
-
-    #[test]
-    fn brightness_to_and_fro_is_flicker() {
-        let flicker = |decoded: &mut Decoded| {
-            for (index, pair) in decoded.pairs.iter_mut().enumerate() {
-                pair.median = [0.0, 2.0, -1.5, 0.3, 1.9, -2.2][index % 6];
-            }
-        };
-        assert_eq!(found(flicker), [(Diagnosis::Flicker, Verdict::Degraded)]);
-        // So strong that all pixels are outliers, at edges as well; still one common shift.
-        let strong = |decoded: &mut Decoded| {
-            for (index, pair) in decoded.pairs.iter_mut().enumerate() {
-                pair.median = if index % 3 == 1 { 12.0 } else { 0.0 };
-                if index % 3 == 1 {
-                    (pair.sigma, pair.flat_outliers, pair.edge_outliers) = (4.0, 0.97, 0.97);
-                }
-            }
-        };
-        assert_eq!(found(strong), [(Diagnosis::Flicker, Verdict::Degraded)]);
-    }
-
-    #[test]
-    fn brightness_that_goes_one_way_is_drift() {
-        let steady = |decoded: &mut Decoded| {
-            for (index, pair) in decoded.pairs.iter_mut().enumerate() {
-                pair.median = 0.3 * index as f64 - 3.0;
-            }
-            decoded.drift = None;
-        };
-        assert_eq!(found(steady), [(Diagnosis::ExposureDrift, Verdict::Degraded)]);
-    }
-
-    #[test]
-    fn references_that_differ_are_drift_of_lamp_or_room() {
-        let drifted = |decoded: &mut Decoded| decoded.drift = Some(-0.05);
-        assert_eq!(found(drifted), [(Diagnosis::ExposureDrift, Verdict::Degraded)]);
-        assert_eq!(found_with(Some(-0.048), drifted), [(Diagnosis::ExposureDrift, Verdict::Degraded)]);
-        assert_eq!(found_with(Some(0.001), drifted), [(Diagnosis::AmbientDrift, Verdict::Degraded)]);
-        assert_eq!(found(|decoded| decoded.drift = Some(0.01)), []);
-    }
-}
+mod tests;

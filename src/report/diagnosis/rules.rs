@@ -2,7 +2,7 @@
 
 use serde_json::json;
 
-use super::{Diagnosis, Reason, order, pairs, sensor};
+use super::{Diagnosis, Reason, Verdict, look::Frames, order, pairs, sensor};
 use crate::{
     cloud::RowCheck,
     decode::{Class, Decoded},
@@ -39,24 +39,44 @@ const ROW_WRONG: f64 = 0.5;
 const ROW_OFFSET: f64 = 0.5;
 /// All reasons why a scan is not `ok`, each diagnosis once.
 pub fn diagnose(input: &ReportInput, pixels: Option<&PixelCounts>) -> Vec<Reason> {
-    let mut reasons = input.found.to_vec();
-    reasons.extend(input.capture.map(frames).unwrap_or_default());
+    let mut reasons = input.capture.map(frames).unwrap_or_default();
     if let Some((decoded, pixels)) = input.decoded.zip(pixels) {
         match nothing_lit(input, decoded, pixels) {
             // All other evidence comes from lit pixels.
             Some(reason) => reasons.push(reason),
-            None => {
-                reasons.extend(pairs::diagnose(decoded, input.modulation_drift));
-                reasons.extend(wrong_order(input, decoded, pixels));
-                reasons.extend(polarization(input, decoded, pixels));
-                reasons.extend(saturated(decoded, pixels));
-                reasons.extend(input.reconstruction.and_then(|made| made.row_check).and_then(row_mismatch));
-                reasons.extend(sensor::defect(decoded, pixels));
-                reasons.extend(low_coverage(pixels));
-            }
+            None => reasons.extend(from_pixels(input, decoded, pixels)),
         }
     }
+    // Last, so that of equals the one with the numbers of the whole scan is kept.
+    reasons.extend_from_slice(input.found);
     once_each(reasons)
+}
+
+fn from_pixels(input: &ReportInput, decoded: &Decoded, pixels: &PixelCounts) -> Vec<Reason> {
+    let look = input.settings.filter(|_| !input.planes.is_empty());
+    let look = look.map(|settings| Frames { all: input.planes, settings, decoded });
+    let mut reasons = pairs::diagnose(decoded, look);
+    let names = [Diagnosis::StaleFrame, Diagnosis::TornFrame, Diagnosis::SwappedFrames];
+    let is_wrong = |reason: &Reason| reason.severity == Verdict::Failed && names.contains(&reason.diagnosis);
+    // A wrong frame puts edges in wrong places, too: that would be said twice.
+    let wrong = reasons.iter().any(is_wrong);
+    reasons.extend(wrong_order(input, decoded, pixels, !wrong));
+    reasons.extend(polarization(input, decoded, pixels));
+    reasons.extend(saturated(decoded, pixels));
+    reasons.extend(input.reconstruction.and_then(|made| made.row_check).and_then(row_mismatch));
+    reasons.extend(sensor::defect(decoded, pixels));
+    reasons.extend(low_coverage(pixels));
+    if reasons.iter().any(is_wrong) {
+        // What comes of words that are wrong says nothing of light, sensor or surface.
+        let follows = [
+            Diagnosis::Flicker,
+            Diagnosis::UnsettledDisplay,
+            Diagnosis::SensorDefect,
+            Diagnosis::LowCoverage,
+        ];
+        reasons.retain(|reason| !follows.contains(&reason.diagnosis));
+    }
+    reasons
 }
 
 /// Of several reasons with the same diagnosis keeps the gravest, of equals the first.
@@ -143,7 +163,12 @@ fn nothing_lit(input: &ReportInput, decoded: &Decoded, pixels: &PixelCounts) -> 
     ))
 }
 
-fn wrong_order(input: &ReportInput, decoded: &Decoded, pixels: &PixelCounts) -> Option<Reason> {
+fn wrong_order(
+    input: &ReportInput,
+    decoded: &Decoded,
+    pixels: &PixelCounts,
+    by_edges: bool,
+) -> Option<Reason> {
     if let Some(found) = order::mirrored(decoded, input.settings) {
         let pair = match found.pair {
             Some((axis, bit)) => format!("most likely the two frames of pair {axis} bit {bit} are exchanged"),
@@ -159,6 +184,9 @@ fn wrong_order(input: &ReportInput, decoded: &Decoded, pixels: &PixelCounts) -> 
             "axis": found.pair.map(|pair| pair.0), "bit": found.pair.map(|pair| pair.1),
         });
         return Some(Reason::failed(Diagnosis::SwappedFrames, message, evidence));
+    }
+    if !by_edges {
+        return None;
     }
     let suspect: Vec<_> = decoded.boundaries.iter().filter(|check| check.is_suspect()).collect();
     let off = share(pixels.off_boundary, pixels.lit).unwrap_or(0.0);
@@ -573,11 +601,13 @@ mod tests {
         };
         assert_eq!(kinds(&specks(5)), []);
         assert_eq!(kinds(&specks(12)), [(Diagnosis::SensorDefect, DEGRADED)]);
-        let column = report(|decoded| classify(decoded, Class::Ambiguous, |x, _| x == 77));
+        let column = report(|decoded| classify(decoded, Class::Unlit, |x, _| x == 77));
         assert_eq!(kinds(&column), [(Diagnosis::SensorDefect, DEGRADED)]);
         assert_eq!(column.reasons[0].evidence["columns"], json!([77]));
         let row = report(|decoded| classify(decoded, Class::Unlit, |_, y| y == 11));
         assert_eq!(row.reasons[0].evidence["rows"], json!([11]));
+        let stripe = report(|decoded| classify(decoded, Class::Ambiguous, |x, _| x == 77));
+        assert_eq!(kinds(&stripe), []);
         // A wide gap is a hole or a shadow.
         let gap = report(|decoded| classify(decoded, Class::Unlit, |x, _| (70..73).contains(&x)));
         assert_eq!(kinds(&gap), []);

@@ -26,7 +26,9 @@ pub fn defect(decoded: &Decoded, pixels: &PixelCounts) -> Option<Reason> {
     let (mut columns, mut rows) = (vec![[0u32; 2]; width], vec![[0u32; 2]; height]);
     for (y, row) in rows.iter_mut().enumerate().take(height.saturating_sub(1)).skip(1) {
         for (x, column) in columns.iter_mut().enumerate().take(width.saturating_sub(1)).skip(1) {
-            let failed = u32::from(!valid(x, y));
+            let class_here = class.at(x, y);
+            // Rejected for its word is not dead: along stripes, whole columns may be.
+            let failed = u32::from(matches!(class_here, Class::Unlit | Class::Saturated));
             let (beside, above) = (valid(x - 1, y) && valid(x + 1, y), valid(x, y - 1) && valid(x, y + 1));
             if beside {
                 column[0] += 1;
@@ -38,7 +40,7 @@ pub fn defect(decoded: &Decoded, pixels: &PixelCounts) -> Option<Reason> {
             }
             let corners =
                 || valid(x - 1, y - 1) && valid(x + 1, y - 1) && valid(x - 1, y + 1) && valid(x + 1, y + 1);
-            dead += u64::from(class.at(x, y) == Class::Unlit && beside && above && corners());
+            dead += u64::from(class_here == Class::Unlit && beside && above && corners());
         }
     }
     let lines = |counts: &[[u32; 2]]| {
