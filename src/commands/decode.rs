@@ -16,6 +16,7 @@ use crate::{
     store::{
         Bundle, BundleWriter, FrameSet, Limits, Manifest, Policy,
         manifest::{Capture, Processing, Volume},
+        source::read_calibration,
     },
 };
 
@@ -141,7 +142,7 @@ fn resolve(
     };
     hints.projector_size = manifest.projector.map(|size| (size.width, size.height));
     let calibration = match args.calibration {
-        Some(path) => Some(Calibration::read_with(path, &hints)?),
+        Some(path) => Some(read_calibration(path, &hints)?),
         None => match bundle.calibration()? {
             Some((path, bytes)) => {
                 let name = path.display().to_string();

@@ -23,6 +23,7 @@ use crate::{
         BundleWriter, Manifest,
         bundle::FRAMES_FILE_NAME,
         manifest::{self, FrameFiles, Processing, Volume},
+        source::read_calibration,
     },
     verify::{PairSumJudge, shared_plane},
 };
@@ -242,8 +243,7 @@ fn calibration(
     let hints =
         ReadHints { camera_size: Some(camera), projector_size: Some(projector), ..ReadHints::default() };
     let operation = || format!("use the calibration {}", path.display());
-    let calibrated =
-        Calibration::read_with(path, &hints).map_err(|error| Failure::data(operation(), error))?;
+    let calibrated = read_calibration(path, &hints).map_err(|error| Failure::data(operation(), error))?;
     calibrated.check_sizes(camera, projector).map_err(|error| Failure::data(operation(), error))?;
     Ok(Some(calibrated))
 }

@@ -10,6 +10,7 @@ use std::{
 use polscan_patterns::Mode;
 use rayon::prelude::*;
 use sha2::{Digest, Sha256};
+use thiserror::Error;
 
 use super::{
     error::{Fault, Faults, InputError},
@@ -17,13 +18,13 @@ use super::{
     manifest::{self, FileEntry, Manifest, Source, path_fault},
     npz,
 };
-use crate::truth::Truth;
+use crate::{
+    geometry::{self, Calibration, CalibrationError, ReadHints},
+    truth::Truth,
+};
 
 /// Longest manifest that is read, in bytes.
 const MAX_MANIFEST_BYTES: u64 = 32 << 20;
-
-/// Longest calibration file that is read, in bytes: toolbox results hold all their corners.
-const MAX_CALIBRATION_BYTES: u64 = 256 << 20;
 
 /// How far a bundle is trusted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -101,7 +102,7 @@ impl Bundle {
     pub fn calibration(&self) -> Result<Option<(PathBuf, Vec<u8>)>, InputError> {
         let Some(name) = &self.manifest.calibration else { return Ok(None) };
         let path = self.resolve(name)?;
-        let bytes = read_bounded(&path, self.policy, "read calibration", MAX_CALIBRATION_BYTES)?;
+        let bytes = read_bounded(&path, self.policy, "read calibration", geometry::MAX_BYTES)?;
         Ok(Some((path, bytes)))
     }
 
@@ -234,6 +235,23 @@ pub(crate) fn read_bounded(
         ));
     }
     Ok(bytes)
+}
+
+/// A calibration file given by a person, in any format that is known.
+pub fn read_calibration(path: &Path, hints: &ReadHints) -> Result<Calibration, CalibrationFileError> {
+    let bytes = read_bounded(path, Policy::Local, "read calibration", geometry::MAX_BYTES)?;
+    Ok(Calibration::from_bytes(&bytes, &path.display().to_string(), hints)?)
+}
+
+/// Why a calibration cannot be had from a file.
+#[derive(Debug, Error)]
+pub enum CalibrationFileError {
+    /// It cannot be read.
+    #[error(transparent)]
+    Input(#[from] InputError),
+    /// Its content cannot be used.
+    #[error(transparent)]
+    Content(#[from] CalibrationError),
 }
 
 /// Length and hash of a file.
