@@ -13,11 +13,12 @@ use polscan_patterns::Axis;
 use rayon::prelude::*;
 
 use super::{
+    limits::Gates,
     noise,
     plan::{Frames, Levels, axis_position},
     sample::Sample,
     types::{CameraResponse, Class, NoiseModel, PairResidual, Plane},
-    words::{Gates, PixelMaps},
+    words::PixelMaps,
 };
 
 /// Rows that are looked at.
