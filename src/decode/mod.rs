@@ -6,6 +6,8 @@
 mod accumulate;
 mod contrast;
 mod gates;
+mod kernels;
+mod limits;
 mod noise;
 #[cfg(test)]
 mod oracle;

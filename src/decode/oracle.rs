@@ -171,5 +171,5 @@ fn indices(code: AxisCode, word: &[bool]) -> Option<(u32, u32)> {
         |index: &u32| word.iter().enumerate().all(|(bit, value)| code.bit(*index, bit as u8) == *value);
     let mut found = (0..code.size()).filter(matching);
     let first = found.next()?;
-    Some((first, found.last().unwrap_or(first)))
+    Some((first, found.next_back().unwrap_or(first)))
 }

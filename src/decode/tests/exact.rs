@@ -7,11 +7,8 @@ use proptest::prelude::*;
 
 use super::synth::{normal, random, uniform};
 use crate::decode::{
-    Accumulator, CameraResponse, Class, DecodeSettings, NoiseModel, SharedPlane, Thresholds,
-    oracle::decode_pixel,
-    plan::plan,
-    sample::Sample,
-    words::{Gates, decode_pixels},
+    Accumulator, CameraResponse, Class, DecodeSettings, NoiseModel, SharedPlane, Thresholds, limits::Gates,
+    oracle::decode_pixel, plan::plan, sample::Sample, words::decode_pixels,
 };
 
 const WIDTH: usize = 16;
@@ -56,9 +53,9 @@ fn random_frames(sequence: &Sequence, bit_depth: u8, seed: u64) -> Vec<(Role, Ve
     sequence.roles.iter().enumerate().map(|(number, &role)| (role, frame(number, role))).collect()
 }
 
-fn shared<T: Sample>(frames: &[(Role, Vec<u16>)]) -> Vec<(Role, SharedPlane)>
+fn shared<T>(frames: &[(Role, Vec<u16>)]) -> Vec<(Role, SharedPlane)>
 where
-    T: TryFrom<u16>,
+    T: Sample + TryFrom<u16>,
     Vec<T>: crate::decode::PlaneSource,
 {
     frames

@@ -162,8 +162,7 @@ fn exchanged_frames_of_a_pair_are_off_boundary() {
     // Few columns, so that the image holds boundaries of every bit.
     let coarse = Sequence::new(Mode::Pse, ProjectorSize { width: 64, height: 768 }).unwrap();
     let gentle = |x: f64, y: f64| Spot { u: 0.2 + 0.19 * x, v: 200.4 + 0.333 * y, ..Spot::default() };
-    // Exchanging the finest pair moves codes by one column, which is within `snap_px`.
-    for bit in 1..5 {
+    for bit in 1..6 {
         let mut frames = rig.scan(&gentle, &coarse);
         let p = frame_of(&mut frames, code(Axis::Column, bit, false)).clone();
         let q = std::mem::replace(frame_of(&mut frames, code(Axis::Column, bit, true)), p);
@@ -172,14 +171,17 @@ fn exchanged_frames_of_a_pair_are_off_boundary() {
         let suspect: Vec<_> = decoded.boundaries.iter().filter(|check| check.is_suspect()).collect();
         assert!(!suspect.is_empty(), "bit {bit}: {:?}", decoded.boundaries);
         assert!(suspect.iter().all(|check| check.axis == Axis::Column), "{suspect:?}");
+        // Exchanging the finest pair moves codes by one column, which is within `snap_px`: reported, not rejected.
         assert!(
-            count(&decoded, Class::OffBoundary) > 60,
+            bit == 5 || count(&decoded, Class::OffBoundary) > 60,
             "bit {bit}: {}",
             count(&decoded, Class::OffBoundary)
         );
     }
     let decoded = rig.decode(&gentle, &coarse);
-    assert!(decoded.boundaries.iter().all(|check| check.illegal == 0), "{:?}", decoded.boundaries);
+    for check in &decoded.boundaries {
+        assert!(check.illegal == 0 && 10 * check.against <= check.legal && !check.is_suspect(), "{check:?}");
+    }
 }
 
 #[test]

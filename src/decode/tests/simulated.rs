@@ -3,7 +3,7 @@
 use polscan_patterns::{Axis, Mode, Role};
 
 use super::synth::{Accuracy, Rig, Spot, accuracy, decode, erf, sequence, uniform};
-use crate::decode::{CameraResponse, Class, DecodeSettings, Decoded};
+use crate::decode::{CameraResponse, Class, DecodeSettings, Decoded, PairContext, pair_residual};
 
 /// 15 % texture on patches of 5 px.
 fn texture(x: f64, y: f64) -> f64 {
@@ -272,6 +272,23 @@ fn timing_at_full_size() {
         .into_iter()
         .map(|(role, frame)| (role, std::sync::Arc::new(frame) as crate::decode::SharedPlane))
         .collect();
+    let plane = |wanted: Role| frames.iter().find(|(role, _)| *role == wanted).unwrap().1.plane();
+    let pair = |inverse| plane(Role::Code { axis: Axis::Column, bit: 3, inverse });
+    let context = PairContext {
+        axis: Axis::Column,
+        bit: 3,
+        width: rig.width,
+        high: &[plane(Role::ReferenceH)],
+        low: &[plane(Role::ReferenceV)],
+        camera: rig.camera(),
+        noise: rig.noise(),
+        lit_sigma: 4.0,
+    };
+    for _ in 0..3 {
+        let start = std::time::Instant::now();
+        let residual = pair_residual(pair(false), pair(true), &context).unwrap();
+        println!("one pair: {:.1} ms, {residual:?}", start.elapsed().as_secs_f64() * 1e3);
+    }
     for round in 0..6 {
         let mut accumulator = crate::decode::Accumulator::new(rig.settings(&sequence)).unwrap();
         for (role, plane) in &frames {
