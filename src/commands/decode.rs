@@ -12,7 +12,7 @@ use crate::{
     cloud::ReconstructSettings,
     geometry::{Calibration, ReadHints},
     pipeline::{self, Context, Job, PipelineError},
-    report::{CaptureSummary, NamedRegion, Timings, Verdict},
+    report::{CaptureSummary, NamedRegion, Reason, Timings, Verdict},
     store::{
         Bundle, BundleWriter, FrameSet, Limits, Manifest, Policy,
         manifest::{Capture, Processing, Volume},
@@ -79,12 +79,13 @@ pub fn decode(args: &DecodeArgs) -> Result<u8, Failure> {
     let truth = bundle.truth().map_err(|e| Failure::data(operation(), e))?;
     let capture = manifest.capture.as_ref().map(|capture| summary(&manifest.sequence, capture));
     let notes: Vec<String> = bundle.notes().iter().chain(&frames.notes).cloned().collect();
+    let found: Vec<Reason> = manifest.capture.iter().flat_map(found).collect();
     let context = Context {
         truth: truth.as_ref(),
         capture: capture.as_ref(),
-        found: &[],
+        found: &found,
         regions: &regions,
-        simulated: truth.is_some(),
+        simulated: truth.is_some() || manifest.rig.as_ref().is_some_and(|rig| rig.camera.driver == "sim"),
         notes: &notes,
     };
     let results = Results {
@@ -92,13 +93,16 @@ pub fn decode(args: &DecodeArgs) -> Result<u8, Failure> {
         outcome: &outcome,
         context: &context,
         timings: Timings { load: Some(load_ms), ..outcome.timings },
-        calibration: calibration.as_ref(),
         frames: None,
     };
     let mut result = Manifest::new(&sequence, bundle.absolute_frames());
     result.id = Some(results::new_id());
     result.label = manifest.label.clone();
+    result.tags = manifest.tags.clone();
     result.rig = manifest.rig.clone();
+    if let Some(rig) = &mut result.rig {
+        rig.calibration_id = calibration.as_ref().map(Calibration::id);
+    }
     result.settings = manifest.settings.clone();
     result.capture = manifest.capture.clone();
     result.source = Some(bundle.origin(&frames).map_err(|e| Failure::data(operation(), e))?);
@@ -106,6 +110,11 @@ pub fn decode(args: &DecodeArgs) -> Result<u8, Failure> {
     let report = results::write(writer, result, &results)?;
     results::print(&report, args.out, args.json);
     Ok(if report.verdict == Verdict::Failed { super::failure::FAILED } else { 0 })
+}
+
+/// What the sequencer found when the frames were captured.
+fn found(capture: &Capture) -> Vec<Reason> {
+    capture.failure.iter().cloned().chain(capture.notes.findings.iter().map(Reason::from)).collect()
 }
 
 /// What a recorded capture says of itself.

@@ -63,6 +63,8 @@ pub struct Override {
     pub key: String,
     /// Value.
     pub value: Value,
+    /// The text that `value` was read from, where it was text.
+    pub text: Option<String>,
     /// Variable or flag, for messages.
     pub origin: String,
 }
@@ -70,7 +72,7 @@ pub struct Override {
 impl Override {
     /// An override by a command-line flag.
     pub fn flag(name: &str, key: &str, value: impl Into<Value>) -> Self {
-        Self { key: key.into(), value: value.into(), origin: format!("flag {name}") }
+        Self { key: key.into(), value: value.into(), text: None, origin: format!("flag {name}") }
     }
 
     /// The overrides among environment variables: those that start with `POLSCAN_` and hold two underscores.
@@ -79,7 +81,8 @@ impl Override {
             .filter_map(|(name, text)| {
                 let (table, key) = name.strip_prefix("POLSCAN_")?.split_once("__")?;
                 let key = format!("{table}.{}", key.replace("__", ".")).to_lowercase();
-                Some(Self { key, value: value_of_text(&text), origin: format!("variable {name}") })
+                let value = value_of_text(&text);
+                Some(Self { key, value, text: Some(text), origin: format!("variable {name}") })
             })
             .collect();
         found.sort_by(|a, b| a.key.cmp(&b.key));
@@ -116,7 +119,12 @@ impl Layers {
             }
         }
         for change in &self.overrides {
-            if let Err(message) = set(&mut table, &change.key, change.value.clone()) {
+            // A serial number of digits only is text all the same.
+            let value = match (get(&table, &change.key), &change.text) {
+                (Some(Value::String(_)), Some(text)) => Value::String(text.clone()),
+                _ => change.value.clone(),
+            };
+            if let Err(message) = set(&mut table, &change.key, value) {
                 faults.push(Fault { key: change.key.clone(), message, origin: Some(change.origin.clone()) });
             }
         }
@@ -313,6 +321,21 @@ mod tests {
         assert_eq!(load("", variable("POLSCAN_SCAN__MOOD", "gray")).unwrap_err(), ["scan.mood"]);
         assert!(load("", variable("POLSCAN_LOG", "debug")).is_ok());
         assert!(load("", variable("OTHER__THING", "1")).is_ok());
+    }
+
+    #[test]
+    fn a_text_of_digits_stays_text() {
+        let settings = load("", variable("POLSCAN_CAMERA__SERIAL", "12345678")).unwrap();
+        assert_eq!(settings.raw.camera.serial, "12345678");
+        let settings = load("", variable("POLSCAN_RIG__NAME", "\"seven\"")).unwrap();
+        assert_eq!(settings.raw.rig.name, "\"seven\"");
+    }
+
+    #[test]
+    fn defaults_of_file_and_code_agree() {
+        let settings = Layers::default().load().unwrap();
+        assert_eq!(settings.thresholds, crate::decode::Thresholds::default());
+        assert_eq!(settings.raw.decode.row_gate_px, crate::cloud::DEFAULT_ROW_GATE_PX);
     }
 
     #[test]

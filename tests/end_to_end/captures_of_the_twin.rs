@@ -70,11 +70,11 @@ fn timetable(rig: &Rig, out: &str) -> Vec<[u64; 3]> {
     let manifest = json(&rig.path(out).join("manifest.json"));
     let frames = manifest["capture"]["frames"].as_array().expect("evidence").clone();
     let time = |value: &serde_json::Value| value.as_u64().expect("a time in ns");
-    let start = time(&frames[0]["receipt"]["flipped"]);
+    let start = time(&frames[0]["receipt"]["flipped_ns"]);
     let row = |frame: &serde_json::Value| {
-        let flipped = time(&frame["receipt"]["flipped"]);
+        let flipped = time(&frame["receipt"]["flipped_ns"]);
         [
-            time(&frame["stamp"]["exposure_start"]) - flipped,
+            time(&frame["stamp"]["exposure_start_ns"]) - flipped,
             flipped - start,
             time(&frame["stamp"]["frame_id"]),
         ]

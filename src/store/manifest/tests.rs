@@ -302,6 +302,8 @@ fn a_full_manifest_of_our_own_survives() {
             evidence: "residual 9.1 sigma".to_owned(),
             attempt: 1,
         }],
+        notes: CaptureNotes::default(),
+        failure: None,
     });
     manifest.truth_objects = Some(vec![TruthObject { name: "white".to_owned(), planar: true }]);
     manifest.processing = Some(Processing {
