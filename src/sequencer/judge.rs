@@ -90,7 +90,7 @@ impl Default for PairThresholds {
             median_degraded: 1.0,
             median_retake: 3.0,
             sigma: 1.5,
-            fine_bits: 3,
+            fine_bits: 2,
         }
     }
 }
