@@ -208,14 +208,82 @@ fn what_a_dead_process_left_is_recognised_and_replaced() {
 #[test]
 fn a_process_that_dies_before_the_last_rename_leaves_a_stale_folder() {
     let folder = TempDir::new().unwrap();
+    let (out, partial) = (folder.path().join("scan"), folder.path().join("scan.partial"));
+    let write = || {
+        let writer = BundleWriter::create(&out, None, 0).unwrap();
+        fill(&writer).unwrap();
+        writer.finish(manifest()).unwrap();
+    };
+    write();
+    fs::rename(&out, &partial).unwrap();
+    fs::write(partial.join(".polscan-partial"), "").unwrap();
+    assert_eq!(remove_stale_partials(folder.path()).unwrap(), [partial.clone()]);
+    assert!(names(folder.path()).is_empty());
+    // A bundle that somebody named so has no marker, and is never removed.
+    write();
+    fs::rename(&out, &partial).unwrap();
+    assert!(remove_stale_partials(folder.path()).unwrap().is_empty());
+    write();
+    assert_whole(&partial);
+    assert_whole(&out);
+}
+
+#[test]
+fn a_process_that_dies_after_the_last_rename_leaves_a_finished_bundle() {
+    let folder = TempDir::new().unwrap();
     let out = folder.path().join("scan");
     let writer = BundleWriter::create(&out, None, 0).unwrap();
     fill(&writer).unwrap();
     writer.finish(manifest()).unwrap();
-    // Complete, unmarked, not yet renamed.
-    fs::rename(&out, folder.path().join("scan.partial")).unwrap();
-    assert_eq!(remove_stale_partials(folder.path()).unwrap().len(), 1);
-    assert!(names(folder.path()).is_empty());
+    fs::write(out.join(".polscan-partial"), "").unwrap();
+    assert!(remove_stale_partials(folder.path()).unwrap().is_empty());
+    assert!(matches!(BundleWriter::create(&out, None, 0), Err(StorageError::Occupied { .. })));
+    let bundle = Bundle::open(&out, Policy::Upload, None).unwrap();
+    bundle.verify().unwrap();
+    assert!(!bundle.manifest().files.contains_key(".polscan-partial"));
+}
+
+/// A disk that looks, right before and after each rename, for folders that a second process would take for stale.
+struct Watched(Arc<AtomicUsize>);
+
+impl Disk for Watched {
+    fn create(&self, path: &Path) -> io::Result<Box<dyn DiskFile>> {
+        RealDisk.create(path)
+    }
+
+    fn create_folder(&self, path: &Path) -> io::Result<()> {
+        RealDisk.create_folder(path)
+    }
+
+    fn rename(&self, from: &Path, to: &Path) -> io::Result<()> {
+        let folder = to.parent().unwrap();
+        assert!(stale_partials(folder).unwrap().is_empty());
+        assert!(matches!(BundleWriter::create(to, None, 0), Err(StorageError::Busy { .. })));
+        self.0.fetch_add(1, Ordering::SeqCst);
+        RealDisk.rename(from, to)?;
+        assert!(stale_partials(folder).unwrap().is_empty());
+        Ok(())
+    }
+
+    fn sync_folder(&self, path: &Path) -> io::Result<()> {
+        RealDisk.sync_folder(path)
+    }
+
+    fn free_bytes(&self, path: &Path) -> io::Result<Option<u64>> {
+        RealDisk.free_bytes(path)
+    }
+}
+
+#[test]
+fn a_finished_folder_is_never_stale_before_it_has_its_name() {
+    let folder = TempDir::new().unwrap();
+    let out = folder.path().join("scan");
+    let renames = Arc::new(AtomicUsize::new(0));
+    let writer = BundleWriter::create_on(Arc::new(Watched(Arc::clone(&renames))), &out, None, 0).unwrap();
+    fill(&writer).unwrap();
+    writer.finish(manifest()).unwrap();
+    assert_eq!(renames.load(Ordering::SeqCst), 1);
+    assert_whole(&out);
 }
 
 #[test]
