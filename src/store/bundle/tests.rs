@@ -77,7 +77,7 @@ fn assert_whole(out: &Path) {
     for (index, plane) in frames.planes.iter().enumerate() {
         assert!(matches!(plane.plane(), Plane::U16(samples) if samples == frame(index)));
     }
-    let read = bundle.truth().unwrap().unwrap();
+    let read = bundle.truth(SIZE).unwrap().unwrap();
     assert_eq!((read.column.data(), read.objects), (truth().column.data(), truth().objects));
 }
 
@@ -284,6 +284,28 @@ fn a_finished_folder_is_never_stale_before_it_has_its_name() {
     writer.finish(manifest()).unwrap();
     assert_eq!(renames.load(Ordering::SeqCst), 1);
     assert_whole(&out);
+}
+
+#[test]
+fn a_truth_that_does_not_fit_the_frames_is_refused() {
+    let folder = TempDir::new().unwrap();
+    let out = folder.path().join("scan");
+    let writer = BundleWriter::create(&out, None, 0).unwrap();
+    fill(&writer).unwrap();
+    writer.finish(manifest()).unwrap();
+    let bundle = Bundle::open(&out, Policy::Local, None).unwrap();
+    let with = |truth: &Truth, size| {
+        let file = File::create(out.join(maps::TRUTH_FILE_NAME)).unwrap();
+        maps::write_truth(file, truth).unwrap();
+        bundle.truth(size).map(drop).map_err(|error| error.to_string())
+    };
+    let error = with(&truth(), (4, 4)).unwrap_err();
+    assert!(error.contains("`column` is 4 x 3, the frames are 4 x 4"), "{error}");
+    let error = with(&Truth { row: Grid::filled(3, 3, 0.0), ..truth() }, SIZE).unwrap_err();
+    assert!(error.contains("`row` is 3 x 3"), "{error}");
+    let error = with(&Truth { object: Grid::filled(4, 3, 1), ..truth() }, SIZE).unwrap_err();
+    assert!(error.contains("`object` holds 1"), "{error}");
+    with(&Truth { object: Grid::filled(4, 3, 255), ..truth() }, SIZE).unwrap();
 }
 
 #[test]
