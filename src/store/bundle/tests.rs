@@ -309,6 +309,28 @@ fn a_truth_that_does_not_fit_the_frames_is_refused() {
 }
 
 #[test]
+fn a_capture_that_was_cut_short_is_kept_and_cannot_be_decoded() {
+    for count in [0, 1, 2] {
+        let folder = TempDir::new().unwrap();
+        let out = folder.path().join("scan");
+        let writer = BundleWriter::create(&out, None, 0).unwrap();
+        let mut frames = writer.frames(count, SIZE, 12).unwrap();
+        (0..count).for_each(|index| frames.push(Plane::U16(&frame(index))).unwrap());
+        frames.finish().unwrap();
+        let mut short = Manifest { truth_objects: None, ..manifest() };
+        short.sequence.truncate(count);
+        assert!(!short.sequence.iter().any(|role| matches!(role, polscan_patterns::Role::Code { .. })));
+        let (written, _) = writer.finish(short).unwrap();
+        let bytes = fs::read(out.join(manifest::FILE_NAME)).unwrap();
+        assert_eq!(Manifest::parse(&bytes).unwrap().manifest, written);
+        let error = Bundle::open(&out, Policy::Local, None).unwrap_err().to_string();
+        assert!(error.contains("no code frames") && error.contains("nothing can be decoded"), "{error}");
+        let entry = &written.files[FRAMES_FILE_NAME];
+        assert_eq!(fs::metadata(out.join(FRAMES_FILE_NAME)).unwrap().len(), entry.bytes);
+    }
+}
+
+#[test]
 fn names_that_are_none_are_refused() {
     let folder = TempDir::new().unwrap();
     let writer = BundleWriter::create(&folder.path().join("scan"), None, 0).unwrap();
@@ -321,8 +343,9 @@ fn names_that_are_none_are_refused() {
 
 #[test]
 fn a_manifest_that_could_not_be_read_back_is_not_written() {
-    let changes: [fn(&mut Manifest); 4] = [
+    let changes: [fn(&mut Manifest); 5] = [
         |manifest| manifest.sequence.clear(),
+        |manifest| manifest.sequence.truncate(3),
         |manifest| manifest.calibration = Some("calibration.toml".to_owned()),
         |manifest| manifest.frames = FrameFiles::Npy("other.npy".to_owned()),
         |manifest| manifest.truth_objects = None,

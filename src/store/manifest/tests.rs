@@ -135,7 +135,7 @@ fn every_fault_is_found_and_named() {
         ("/code_bits/column", json!(17), "17 code bits"),
         ("/code_offset/column", json!(1), "10 code bits and offset 1 cannot number 1024"),
         ("/code_offset/row", json!(4_294_967_295u32), "cannot number 768"),
-        ("/sequence", json!([]), "no frame with role \"code\""),
+        ("/sequence", json!([]), "no code frames (role \"code\")"),
         ("/sequence", json!("all"), "must be a list"),
         ("/sequence/0", json!({"role": "wite"}), "`sequence[0]`: unknown variant `wite`"),
         ("/sequence/0", json!({"role": "white", "inverse": true}), "unknown key `inverse`"),
