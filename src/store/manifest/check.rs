@@ -240,17 +240,10 @@ impl Manifest {
                 let message = format!("is {} px, expected a positive number", processing.row_gate_px);
                 faults.push(Fault::new("processing.row_gate_px", message));
             }
-            let gates = processing.thresholds;
-            for (key, gate) in [
-                ("lit_sigma", gates.lit_sigma),
-                ("soft_bit_sigma", gates.soft_bit_sigma),
-                ("snap_px", gates.snap_px),
-            ] {
-                if !(gate.is_finite() && gate >= 0.0) {
-                    let message = format!("is {gate}, expected a number that is not negative");
-                    faults.push(Fault::new(format!("processing.thresholds.{key}"), message));
-                }
-            }
+            let gates = processing.thresholds.faults().into_iter();
+            faults.extend(
+                gates.map(|(key, message)| Fault::new(format!("processing.thresholds.{key}"), message)),
+            );
         }
         for (name, entry) in &self.files {
             if entry.sha256.len() != 64 || !entry.sha256.bytes().all(|digit| digit.is_ascii_hexdigit()) {
