@@ -76,7 +76,7 @@ pub fn decode(args: &DecodeArgs) -> Result<u8, Failure> {
     };
     let outcome = pipeline::run(&job).map_err(|error: PipelineError| Failure::data(operation(), error))?;
 
-    let truth = bundle.truth().map_err(|e| Failure::data(operation(), e))?;
+    let truth = bundle.truth((frames.width, frames.height)).map_err(|e| Failure::data(operation(), e))?;
     let capture = manifest.capture.as_ref().map(|capture| summary(&manifest.sequence, capture));
     let notes: Vec<String> = bundle.notes().iter().chain(&frames.notes).cloned().collect();
     let found: Vec<Reason> = manifest.capture.iter().flat_map(found).collect();
