@@ -49,7 +49,7 @@ impl Rig {
         let (camera, projector) = (&settings.raw.camera, &settings.raw.projector);
         let simulated = simulated(settings)?;
         match (camera.driver, projector.driver, &simulated) {
-            (DeviceDriver::Sim, DeviceDriver::Sim, Some((rig, clock))) => Ok(Self {
+            (DeviceDriver::Sim, DeviceDriver::Sim, Some(Simulated { rig, clock })) => Ok(Self {
                 clock: clock.clone(),
                 camera: rig.cameras().open(some(&camera.serial).as_deref())?,
                 projector: rig.projectors().open(some(&projector.serial).as_deref())?,
@@ -73,18 +73,24 @@ impl Rig {
 
 /// All cameras and all projectors that the configured drivers find.
 pub fn list(settings: &Settings) -> Result<(Vec<Listing>, Vec<Listing>), RigError> {
-    let Some((rig, _)) = simulated(settings)? else {
+    let Some(Simulated { rig, .. }) = simulated(settings)? else {
         return Ok((Vec::new(), Vec::new()));
     };
     Ok((rig.cameras().list()?, rig.projectors().list()?))
 }
 
-fn simulated(settings: &Settings) -> Result<Option<(sim::Rig, Arc<dyn Clock>)>, RigError> {
+/// A simulated rig and the clock that it runs by.
+struct Simulated {
+    rig: sim::Rig,
+    clock: Arc<dyn Clock>,
+}
+
+fn simulated(settings: &Settings) -> Result<Option<Simulated>, RigError> {
     let (Some((description, scene)), DeviceDriver::Sim) = (&settings.sim, settings.raw.camera.driver) else {
         return Ok(None);
     };
     let clock = description.pacing.clock();
-    Ok(Some((sim::Rig::new(description, scene, clock.clone())?, clock)))
+    Ok(Some(Simulated { rig: sim::Rig::new(description, scene, clock.clone())?, clock }))
 }
 
 fn truth_maps(truth: &sim::Truth) -> Truth {

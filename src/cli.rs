@@ -54,7 +54,7 @@ struct Scan {
     #[arg(long)]
     mode: Option<Mode>,
     /// Exposure time in microseconds.
-    #[arg(long, value_name = "US")]
+    #[arg(long, value_name = "US", allow_negative_numbers = true)]
     exposure_us: Option<f64>,
     /// Rectangle of the camera image to measure as a plane, as NAME=x,y,width,height. May be repeated.
     #[arg(long, value_name = "NAME=X,Y,W,H")]

@@ -65,8 +65,17 @@ impl Source {
         Self { path: path.into(), text: text.into() }
     }
 
+    /// Whether the whole file is tests: `tests.rs` beside a module, or below a folder `tests`. The rule
+    /// [`untested_tests`] makes sure that such a module is compiled for tests only.
+    fn is_tests(&self) -> bool {
+        self.path.ends_with("/tests.rs") || self.path.contains("/tests/")
+    }
+
     /// The text before the module of tests at its end.
     fn before_tests(&self) -> &str {
+        if self.is_tests() {
+            return "";
+        }
         let inline = |at: &usize| {
             let rest = &self.text[*at..];
             let item = &rest[..rest.find(['{', ';']).map_or(rest.len(), |end| end + 1)];
@@ -365,6 +374,21 @@ fn overlong(source: &Source) -> Vec<String> {
     )]
 }
 
+/// A module called `tests` is left out of the program.
+fn untested_tests(source: &Source) -> Vec<String> {
+    let code = blank(&source.text);
+    let lines: Vec<_> = code.lines().map(str::trim).collect();
+    let declares = |line: &str| {
+        let name = line.strip_prefix("mod ").or_else(|| line.strip_prefix("pub mod "));
+        name.is_some_and(|name| name.trim_end_matches([';', '{', ' ']) == "tests")
+    };
+    let marked = |at: usize| {
+        lines[..at].iter().rev().take_while(|line| line.starts_with("#[")).any(|line| *line == "#[cfg(test)]")
+    };
+    let found = (0..lines.len()).filter(|&at| declares(lines[at]) && !marked(at));
+    found.map(|at| format!("{}:{}: tests without #[cfg(test)]", source.path, at + 1)).collect()
+}
+
 /// Nothing is pulled in around the crates' borders.
 fn smuggled(source: &Source) -> Vec<String> {
     let code = blank(&source.text);
@@ -484,6 +508,11 @@ mod tree {
         check(sources(&CODE).iter().flat_map(overlong));
     }
 
+    #[test]
+    fn tests_are_left_out_of_the_program() {
+        check(sources(&CODE).iter().flat_map(untested_tests));
+    }
+
     /// An error in the scanner's geometry must not be able to hide in the twin that it is tested with.
     #[test]
     fn twin_and_geometry_share_no_code() {
@@ -584,6 +613,18 @@ mod rules {
         );
         let tested = format!("fn f() {{}}\n\n#[cfg(test)]\nmod tests {{\n{long}}}\n");
         assert_eq!(count(overlong, "src/a.rs", &tested), 0);
+    }
+
+    #[test]
+    fn file_of_tests_is_judged_as_tests() {
+        assert_eq!(count(impurities, "src/decode/tests.rs", "use std::fs;"), 0);
+        assert_eq!(count(impurities, "src/decode/tests/bench.rs", "use std::fs;"), 0);
+        assert_eq!(count(impurities, "src/decode/contests.rs", "use std::fs;"), 1);
+        assert_eq!(
+            count(untested_tests, "src/decode/mod.rs", "#[cfg(test)]\n#[rustfmt::skip]\nmod tests;"),
+            0
+        );
+        assert_eq!(count(untested_tests, "src/decode/mod.rs", "mod tests;\nmod contests;"), 1);
     }
 
     #[test]

@@ -15,6 +15,15 @@ struct Config {
     sim: RigDescription,
 }
 
+/// Processor time of this process so far in ms, in steps of 10; on Linux only.
+fn processor_ms() -> Option<f64> {
+    let text = std::fs::read_to_string("/proc/self/stat").ok()?;
+    // After the name in parentheses, user and system ticks are fields 12 and 13.
+    let fields: Vec<&str> = text.rsplit(')').next()?.split_whitespace().collect();
+    let ticks = |field: usize| fields.get(field)?.parse::<f64>().ok();
+    Some(10.0 * (ticks(11)? + ticks(12)?))
+}
+
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let default = concat!(env!("CARGO_MANIFEST_DIR"), "/../config/sim.toml");
     let path = std::env::args().nth(1).unwrap_or_else(|| default.to_owned());
@@ -56,6 +65,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         let settled = shown.flipped + std::time::Duration::from_millis(300);
         clock.sleep_until(settled);
         let mut times = Vec::new();
+        let processor = processor_ms();
         for _ in 0..count {
             camera.trigger(clock.now())?;
             let start = Instant::now();
@@ -63,8 +73,11 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             times.push(1e3 * start.elapsed().as_secs_f64());
         }
         times.sort_by(f64::total_cmp);
+        let processor = processor_ms()
+            .zip(processor)
+            .map_or(f64::NAN, |(after, before)| (after - before) / f64::from(count));
         println!(
-            "{name}: best {:.1} ms, median {:.1} ms, worst {:.1} ms",
+            "{name}: best {:.1} ms, median {:.1} ms, worst {:.1} ms, processor {processor:.0} ms a frame",
             times[0],
             times[times.len() / 2],
             times[times.len() - 1]

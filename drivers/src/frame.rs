@@ -65,8 +65,10 @@ pub struct FrameStamp {
     /// Number of the trigger that the driver believes this frame answers, from 0 since arming.
     pub trigger: u64,
     /// Start of exposure on the rig's clock as well as it is known.
+    #[serde(rename = "exposure_start_ns")]
     pub exposure_start: Timestamp,
     /// When the whole frame had arrived, on the rig's clock.
+    #[serde(rename = "received_ns")]
     pub received: Timestamp,
     /// The camera's own clock in nanoseconds, where it has one.
     pub device_time_ns: Option<u64>,

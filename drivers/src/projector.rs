@@ -44,6 +44,7 @@ pub struct PresentReceipt {
     /// Index of the slide in the loaded set, `None` for black.
     pub slide: Option<u32>,
     /// When the picture was flipped to scan-out, on the rig's clock. Light follows after the projector's latency.
+    #[serde(rename = "flipped_ns")]
     pub flipped: Timestamp,
     /// Number of the refresh at which it was flipped, where it is known.
     pub refresh: Option<u64>,
@@ -65,17 +66,36 @@ pub struct ProjectorInfo {
     /// Native rows.
     pub height: u32,
     /// Time between refreshes.
+    #[serde(rename = "refresh_period_ms", with = "milliseconds")]
     pub refresh_period: Duration,
     /// From flip to first light, and until the picture has settled, where it has been measured or is known.
     pub timing: Option<ProjectorTiming>,
+}
+
+/// Durations in files: milliseconds as a number.
+mod milliseconds {
+    use std::time::Duration;
+
+    use serde::{Deserialize, Deserializer, Serializer, de::Error};
+
+    pub(super) fn serialize<S: Serializer>(duration: &Duration, out: S) -> Result<S::Ok, S::Error> {
+        out.serialize_f64(duration.as_secs_f64() * 1e3)
+    }
+
+    pub(super) fn deserialize<'de, D: Deserializer<'de>>(input: D) -> Result<Duration, D::Error> {
+        let ms = f64::deserialize(input)?;
+        Duration::try_from_secs_f64(ms * 1e-3).map_err(|error| D::Error::custom(format!("{ms} ms: {error}")))
+    }
 }
 
 /// Measured delays of a projector.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct ProjectorTiming {
     /// From flip to first light.
+    #[serde(rename = "latency_ms", with = "milliseconds")]
     pub latency: Duration,
     /// From first light until the residue of the previous picture is below 0.1 % of full scale.
+    #[serde(rename = "settling_ms", with = "milliseconds")]
     pub settling: Duration,
 }
 

@@ -1,5 +1,7 @@
 //! What every driver owes the scanner, checked on each of them.
 
+#![allow(clippy::unwrap_used, reason = "helpers of tests are tests")]
+
 mod common;
 
 use std::{sync::Arc, time::Duration};

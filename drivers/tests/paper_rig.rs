@@ -1,5 +1,7 @@
 //! The configurations that come with the scanner.
 
+#![allow(clippy::unwrap_used, reason = "helpers of tests are tests")]
+
 mod common;
 
 use common::{Bench, H, V, config_text, mean, paper_rig, scene};

@@ -1,5 +1,7 @@
 //! The simulated rig against physics: what is on its frames, seen only through its camera.
 
+#![allow(clippy::unwrap_used, reason = "helpers of tests are tests")]
+
 mod common;
 
 use std::time::Duration;

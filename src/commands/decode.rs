@@ -12,10 +12,11 @@ use crate::{
     cloud::ReconstructSettings,
     geometry::{Calibration, ReadHints},
     pipeline::{self, Context, Job, PipelineError},
-    report::{CaptureSummary, NamedRegion, Timings, Verdict},
+    report::{CaptureSummary, NamedRegion, Reason, Timings, Verdict},
     store::{
         Bundle, BundleWriter, FrameSet, Limits, Manifest, Policy,
         manifest::{Capture, Processing, Volume},
+        source::read_calibration,
     },
 };
 
@@ -75,15 +76,16 @@ pub fn decode(args: &DecodeArgs) -> Result<u8, Failure> {
     };
     let outcome = pipeline::run(&job).map_err(|error: PipelineError| Failure::data(operation(), error))?;
 
-    let truth = bundle.truth().map_err(|e| Failure::data(operation(), e))?;
+    let truth = bundle.truth((frames.width, frames.height)).map_err(|e| Failure::data(operation(), e))?;
     let capture = manifest.capture.as_ref().map(|capture| summary(&manifest.sequence, capture));
     let notes: Vec<String> = bundle.notes().iter().chain(&frames.notes).cloned().collect();
+    let found: Vec<Reason> = manifest.capture.iter().flat_map(found).collect();
     let context = Context {
         truth: truth.as_ref(),
         capture: capture.as_ref(),
-        found: &[],
+        found: &found,
         regions: &regions,
-        simulated: truth.is_some(),
+        simulated: truth.is_some() || manifest.rig.as_ref().is_some_and(|rig| rig.camera.driver == "sim"),
         notes: &notes,
     };
     let results = Results {
@@ -91,12 +93,16 @@ pub fn decode(args: &DecodeArgs) -> Result<u8, Failure> {
         outcome: &outcome,
         context: &context,
         timings: Timings { load: Some(load_ms), ..outcome.timings },
-        calibration: calibration.as_ref(),
         frames: None,
     };
     let mut result = Manifest::new(&sequence, bundle.absolute_frames());
+    result.id = Some(results::new_id());
     result.label = manifest.label.clone();
+    result.tags = manifest.tags.clone();
     result.rig = manifest.rig.clone();
+    if let Some(rig) = &mut result.rig {
+        rig.calibration_id = calibration.as_ref().map(Calibration::id);
+    }
     result.settings = manifest.settings.clone();
     result.capture = manifest.capture.clone();
     result.source = Some(bundle.origin(&frames).map_err(|e| Failure::data(operation(), e))?);
@@ -104,6 +110,11 @@ pub fn decode(args: &DecodeArgs) -> Result<u8, Failure> {
     let report = results::write(writer, result, &results)?;
     results::print(&report, args.out, args.json);
     Ok(if report.verdict == Verdict::Failed { super::failure::FAILED } else { 0 })
+}
+
+/// What the sequencer found when the frames were captured.
+fn found(capture: &Capture) -> Vec<Reason> {
+    capture.failure.iter().cloned().chain(capture.notes.findings.iter().map(Reason::from)).collect()
 }
 
 /// What a recorded capture says of itself.
@@ -140,7 +151,7 @@ fn resolve(
     };
     hints.projector_size = manifest.projector.map(|size| (size.width, size.height));
     let calibration = match args.calibration {
-        Some(path) => Some(Calibration::read_with(path, &hints)?),
+        Some(path) => Some(read_calibration(path, &hints)?),
         None => match bundle.calibration()? {
             Some((path, bytes)) => {
                 let name = path.display().to_string();

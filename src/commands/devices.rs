@@ -9,16 +9,19 @@ use crate::{app, config::Settings};
 pub fn devices(settings: &Settings, json: bool) -> Result<u8, Failure> {
     let (cameras, projectors) = app::list(settings).map_err(super::scan::rig_failure)?;
     if json {
-        println!("{}", serde_json::json!({ "cameras": cameras, "projectors": projectors }));
+        super::say(serde_json::json!({ "cameras": cameras, "projectors": projectors }));
         return Ok(0);
     }
     for (kind, found) in [("camera", cameras), ("projector", projectors)] {
         if found.is_empty() {
-            println!("{kind}: none; set {kind}.driver in the file given with --config");
+            super::say(format_args!("{kind}: none; set {kind}.driver in the file given with --config"));
         }
         for device in found {
             let state = device.unusable.as_deref().unwrap_or("usable");
-            println!("{kind}: {} {} (driver {}): {state}", device.model, device.serial, device.driver);
+            super::say(format_args!(
+                "{kind}: {} {} (driver {}): {state}",
+                device.model, device.serial, device.driver
+            ));
         }
     }
     Ok(0)
@@ -27,8 +30,8 @@ pub fn devices(settings: &Settings, json: bool) -> Result<u8, Failure> {
 /// Says that a configuration has no fault.
 pub fn config_is_good(file: &Path, json: bool) {
     if json {
-        println!("{}", serde_json::json!({ "file": file, "faults": [] }));
+        super::say(serde_json::json!({ "file": file, "faults": [] }));
     } else {
-        println!("{}: no fault", file.display());
+        super::say(format_args!("{}: no fault", file.display()));
     }
 }

@@ -3,7 +3,8 @@
 use polscan_drivers::error::DeviceError;
 use thiserror::Error;
 
-use crate::{config::ConfigError, decode::DecodeError};
+use super::say;
+use crate::config::ConfigError;
 
 /// Exit code: done, but the result is a failure that the report names.
 pub const FAILED: u8 = 1;
@@ -24,6 +25,15 @@ pub enum Failure {
     /// The configuration has faults.
     #[error(transparent)]
     Config(#[from] ConfigError),
+    /// Settings that are sound one by one do not go together.
+    #[error("cannot {operation}")]
+    Setup {
+        /// What was attempted.
+        operation: &'static str,
+        /// What does not go together and what to change.
+        #[source]
+        source: Box<dyn std::error::Error + Send + Sync>,
+    },
     /// A device is missing or refuses.
     #[error("cannot {operation}")]
     Device {
@@ -81,7 +91,7 @@ impl Failure {
     /// Documented exit code.
     pub fn code(&self) -> u8 {
         match self {
-            Self::Config(_) => CONFIG,
+            Self::Config(_) | Self::Setup { .. } => CONFIG,
             Self::Device { .. } | Self::NoDevice { .. } => UNAVAILABLE,
             Self::Data { .. } => DATA,
             Self::Storage { .. } => STORAGE,
@@ -91,7 +101,7 @@ impl Failure {
     /// Stable slug for scripts.
     fn slug(&self) -> &'static str {
         match self {
-            Self::Config(_) => "config",
+            Self::Config(_) | Self::Setup { .. } => "config",
             Self::Device { .. } | Self::NoDevice { .. } => "unavailable",
             Self::Data { .. } => "data",
             Self::Storage { .. } => "storage",
@@ -111,12 +121,6 @@ impl Failure {
     }
 }
 
-impl From<DecodeError> for Failure {
-    fn from(error: DecodeError) -> Self {
-        Self::data("decode the frames", error)
-    }
-}
-
 /// Says on stderr what went wrong, and on stdout as JSON where that was asked for.
 pub fn print_failure(failure: &Failure, json: bool) {
     eprintln!("polscan: {}", failure.chain());
@@ -129,6 +133,6 @@ pub fn print_failure(failure: &Failure, json: bool) {
                 .map(|fault| serde_json::json!({ "key": fault.key, "message": fault.message, "origin": fault.origin }))
                 .collect();
         }
-        println!("{}", serde_json::json!({ "error": error, "exit_code": failure.code() }));
+        say(serde_json::json!({ "error": error, "exit_code": failure.code() }));
     }
 }

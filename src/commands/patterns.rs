@@ -56,24 +56,24 @@ pub fn patterns(
     writer.finish(manifest).map_err(failed)?;
     if json {
         let object = serde_json::json!({ "out": out, "mode": mode, "projector": size, "frames": names });
-        println!("{object}");
+        super::say(object);
     } else {
-        println!(
+        super::say(format_args!(
             "{} patterns of mode {mode} for {}x{} px, described by manifest.json, in {}",
             names.len(),
             size.width,
             size.height,
             out.display()
-        );
+        ));
     }
     Ok(0)
 }
 
 /// Size of the configured projector.
 fn configured_size(settings: &Settings) -> Result<ProjectorSize, Failure> {
-    let rig = crate::app::Rig::open(settings).map_err(|_| Failure::NoDevice {
+    let rig = crate::app::Rig::open(settings).map_err(|error| Failure::NoDevice {
         operation: "choose the size of the patterns",
-        message: "no projector is configured; give --size WIDTHxHEIGHT or a --config with one".into(),
+        message: format!("{error}; or give --size WIDTHxHEIGHT"),
     })?;
     let info = rig.projector.info();
     Ok(ProjectorSize { width: info.width, height: info.height })

@@ -22,8 +22,6 @@ pub struct Results<'a> {
     pub context: &'a Context<'a>,
     /// Times known before writing.
     pub timings: Timings,
-    /// Calibration that was used.
-    pub calibration: Option<&'a Calibration>,
     /// Frames to store; `None` where the manifest names another bundle's.
     pub frames: Option<&'a [SharedPlane]>,
 }
@@ -44,11 +42,7 @@ pub fn write(writer: BundleWriter, mut manifest: Manifest, results: &Results) ->
         writer.truth(truth).map_err(failed)?;
         manifest.truth_objects = Some(truth.objects.clone());
     }
-    if let Some(calibrated) = results.calibration {
-        let toml = calibrated.to_toml();
-        writer.bytes(bundle::CALIBRATION_FILE_NAME, toml.as_bytes()).map_err(failed)?;
-        manifest.calibration = Some(bundle::CALIBRATION_FILE_NAME.into());
-    }
+    write_calibration(&writer, &mut manifest, job.calibration).map_err(failed)?;
     manifest.record_decode(&job.decode);
     manifest.stamp(std::time::SystemTime::now());
     let timings = Timings { write: Some(milliseconds(start)), ..results.timings };
@@ -64,17 +58,29 @@ pub fn write_unfinished(
     mut manifest: Manifest,
     decode: &DecodeSettings,
     frames: &[SharedPlane],
+    calibration: Option<&Calibration>,
     report: impl FnOnce(Timings) -> Report,
 ) -> Result<Report, Failure> {
     let start = Instant::now();
     let failed = |error: StorageError| Failure::storage("write what was captured", error);
     write_frames(&writer, decode, frames).map_err(failed)?;
+    write_calibration(&writer, &mut manifest, calibration).map_err(failed)?;
     manifest.record_decode(decode);
     manifest.stamp(std::time::SystemTime::now());
     let report = report(Timings { write: Some(milliseconds(start)), ..Timings::default() });
     write_report(&writer, &report)?;
     writer.finish(manifest).map_err(failed)?;
     Ok(report)
+}
+
+fn write_calibration(
+    writer: &BundleWriter,
+    manifest: &mut Manifest,
+    calibration: Option<&Calibration>,
+) -> Result<(), StorageError> {
+    let Some(calibration) = calibration else { return Ok(()) };
+    manifest.calibration = Some(bundle::CALIBRATION_FILE_NAME.into());
+    writer.bytes(bundle::CALIBRATION_FILE_NAME, calibration.to_toml().as_bytes())
 }
 
 fn milliseconds(since: Instant) -> f64 {
@@ -116,12 +122,16 @@ fn write_cloud(writer: &BundleWriter, results: &Results) -> Result<(), StorageEr
 /// Prints the report for a person, or as JSON for a script.
 pub fn print(report: &Report, out: &Path, json: bool) {
     if json {
-        println!("{}", serde_json::json!({ "out": out, "verdict": report.verdict, "report": report }));
+        super::say(serde_json::json!({ "out": out, "verdict": report.verdict, "report": report }));
         return;
     }
-    let mut files = vec!["overview.png", "report.json", "maps.npz", "maps/"];
-    if report.points.is_some() {
-        files.splice(0..0, ["cloud.ply", "cloud.png"]);
-    }
-    print!("{}", report::summary(report, Some(Outputs { directory: out, files: &files })));
+    let named = ["cloud.ply", "cloud.png", "overview.png", "report.json", "maps.npz", "maps/", "frames.npy"];
+    let files: Vec<&str> = named.into_iter().filter(|name| out.join(name).exists()).collect();
+    super::say(report::summary(report, Some(Outputs { directory: out, files: &files })).trim_end());
+}
+
+/// Time in milliseconds and the process: unique on a machine, and sorted by time.
+pub fn new_id() -> String {
+    let since = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).unwrap_or_default();
+    format!("{:012x}-{:x}", since.as_millis(), std::process::id())
 }

@@ -14,15 +14,19 @@ use crate::{
     app::{Rig, RigError},
     cloud::ReconstructSettings,
     config::Settings,
-    decode::{CameraResponse, DecodeSettings, NoiseModel, SharedPlane},
+    decode::{Accumulator, CameraResponse, DecodeSettings, NoiseModel, SharedPlane},
     geometry::{Calibration, ReadHints},
     pipeline::{self, Context, Job},
-    report::{CaptureSummary, NamedRegion, Reason, Report, Verdict},
-    sequencer::{CancelFlag, CaptureFailure, CaptureRecord, Plan, PlanError, PlanOptions, Progress, capture},
+    report::{self, CaptureSummary, Diagnosis, NamedRegion, Reason, Report, ReportInput, Size, Verdict},
+    sequencer::{
+        CancelFlag, CaptureFailure, CaptureRecord, PartialCapture, Plan, PlanError, PlanOptions, Progress,
+        capture,
+    },
     store::{
         BundleWriter, Manifest,
         bundle::FRAMES_FILE_NAME,
         manifest::{self, FrameFiles, Processing, Volume},
+        source::read_calibration,
     },
     verify::{PairSumJudge, shared_plane},
 };
@@ -69,14 +73,15 @@ pub fn scan(settings: &Settings, regions: &[NamedRegion], out: &Path, json: bool
         thresholds: settings.thresholds,
     };
     let plan = Plan::new(sequence.clone(), settings.polarization, &info, applied, &plan_options(settings))
-        .map_err(|e: PlanError| Failure::data("plan the capture", e))?;
+        .map_err(|error: PlanError| setup("plan the capture", error))?;
+    // What no frames can be decoded with is refused before any is captured.
+    Accumulator::new(decode.clone()).map_err(|error| setup("decode with these settings", error))?;
     let bar = Bar::new(sequence.roles.len() as u64);
     let taken = take(&mut rig, &plan, PairSumJudge::new(sequence.clone(), camera, settings.thresholds), &bar);
     bar.say("decoding");
 
     let mut manifest = Manifest::new(&sequence, FrameFiles::Npy(FRAMES_FILE_NAME.into()));
-    manifest.label = None;
-    manifest.id = Some(new_id());
+    manifest.id = Some(results::new_id());
     manifest.rig = Some(manifest::Rig {
         name: settings.raw.rig.name.clone(),
         camera: rig.camera.info().clone(),
@@ -94,7 +99,9 @@ pub fn scan(settings: &Settings, regions: &[NamedRegion], out: &Path, json: bool
     let setup = Setup { settings, rig: &rig, decode, calibration: calibration.as_ref(), volume, regions };
     let report = match taken {
         Ok(record) => finish(&setup, &record, manifest, writer)?,
-        Err(failure) => keep(&setup, &failure, &sequence, manifest, writer)?,
+        Err(CaptureFailure { error, partial }) => {
+            keep(&setup, &partial_record(&plan, *partial), Reason::from(&*error), manifest, writer)?
+        }
     };
     drop(bar);
     results::print(&report, out, json);
@@ -132,11 +139,18 @@ fn finish(
             row_gate_px: setup.settings.raw.decode.row_gate_px,
         },
     };
-    let outcome = pipeline::run(&job).map_err(|error| Failure::data("decode the frames", error))?;
+    manifest.record_capture(record, setup.settings.camera.clone());
+    let outcome = match pipeline::run(&job) {
+        Ok(outcome) => outcome,
+        Err(error) => {
+            let message = format!("the frames were captured but cannot be decoded: {error}");
+            let reason = Reason::failed(Diagnosis::DecodeFailed, message, serde_json::Value::Null);
+            return keep(setup, record, reason, manifest, writer);
+        }
+    };
     let truth = setup.rig.truth();
     let summary = CaptureSummary::from(record);
     let found: Vec<Reason> = record.notes.findings.iter().map(Reason::from).collect();
-    manifest.record_capture(record, setup.settings.camera.clone());
     let context = Context {
         truth: truth.as_ref(),
         capture: Some(&summary),
@@ -150,35 +164,57 @@ fn finish(
         outcome: &outcome,
         context: &context,
         timings: outcome.timings,
-        calibration: setup.calibration,
         frames: Some(&planes),
     };
     results::write(writer, manifest, &results)
 }
 
-/// Keeps what an unfinished capture left, with a report that says why there is no more.
+/// Keeps the frames of a capture that came to no result, with a report that says why.
 fn keep(
     setup: &Setup,
-    failure: &CaptureFailure,
-    sequence: &Sequence,
+    record: &CaptureRecord,
+    reason: Reason,
     mut manifest: Manifest,
     writer: BundleWriter,
 ) -> Result<Report, Failure> {
-    let frames = &failure.partial.frames;
-    manifest.sequence = frames.iter().map(|captured| captured.role).collect();
-    let planes: Vec<SharedPlane> = frames.iter().map(|captured| shared_plane(&captured.frame)).collect();
+    manifest.sequence = record.frames.iter().map(|captured| captured.role).collect();
+    manifest.record_capture(record, setup.settings.camera.clone());
+    if let Some(capture) = &mut manifest.capture {
+        capture.failure = Some(reason.clone());
+    }
+    let planes: Vec<SharedPlane> =
+        record.frames.iter().map(|captured| shared_plane(&captured.frame)).collect();
+    let summary = CaptureSummary::from(record);
+    let found: Vec<Reason> =
+        std::iter::once(reason).chain(record.notes.findings.iter().map(Reason::from)).collect();
     let simulated = setup.rig.is_simulated();
-    results::write_unfinished(writer, manifest, &setup.decode, &planes, |timings| {
-        let size = crate::report::Size { width: setup.decode.width, height: setup.decode.height };
-        let mut found: Vec<Reason> = failure.partial.notes.findings.iter().map(Reason::from).collect();
-        found.insert(0, Reason::from(&*failure.error));
-        crate::report::build(&crate::report::ReportInput {
+    results::write_unfinished(writer, manifest, &setup.decode, &planes, setup.calibration, |timings| {
+        let size = Size { width: setup.decode.width, height: setup.decode.height };
+        report::build(&ReportInput {
+            capture: Some(&summary),
             found: &found,
             timings,
             simulated,
-            ..crate::report::ReportInput::new(sequence.mode, size, planes.len())
+            threads: rayon::current_num_threads(),
+            ..ReportInput::new(setup.decode.mode, size, planes.len())
         })
     })
+}
+
+/// What an unfinished capture left, in the form of a finished one.
+fn partial_record(plan: &Plan, partial: PartialCapture) -> CaptureRecord {
+    CaptureRecord {
+        frames: partial.frames,
+        retaken: partial.retaken,
+        seconds: partial.seconds,
+        limit_seconds: plan.limit().as_secs_f64(),
+        latency_ms: plan.timing.trigger_delay.as_secs_f64() * 1e3,
+        hold_refreshes: plan.timing.hold_refreshes,
+        timing_measured: plan.timing.measured,
+        applied: plan.applied.clone(),
+        statistics: partial.statistics.unwrap_or_default(),
+        notes: partial.notes,
+    }
 }
 
 fn take(
@@ -209,6 +245,7 @@ fn cancel_on_interrupt(cancel: &CancelFlag) {
             std::process::exit(130);
         }
         cancel.cancel();
+        eprintln!("polscan: stopping; interrupt again to end at once");
     });
     if let Err(error) = installed {
         tracing::warn!(%error, "an interrupt will end the program without a black projector");
@@ -243,16 +280,9 @@ fn calibration(
     let hints =
         ReadHints { camera_size: Some(camera), projector_size: Some(projector), ..ReadHints::default() };
     let operation = || format!("use the calibration {}", path.display());
-    let calibrated =
-        Calibration::read_with(path, &hints).map_err(|error| Failure::data(operation(), error))?;
+    let calibrated = read_calibration(path, &hints).map_err(|error| Failure::data(operation(), error))?;
     calibrated.check_sizes(camera, projector).map_err(|error| Failure::data(operation(), error))?;
     Ok(Some(calibrated))
-}
-
-/// Time in milliseconds and the process: unique on a machine, and sorted by time.
-fn new_id() -> String {
-    let since = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).unwrap_or_default();
-    format!("{:012x}-{:x}", since.as_millis(), std::process::id())
 }
 
 fn device<T>(
@@ -262,9 +292,15 @@ fn device<T>(
     result.map_err(|source| Failure::Device { operation, source })
 }
 
+/// Settings that do not go together.
+fn setup(operation: &'static str, error: impl std::error::Error + Send + Sync + 'static) -> Failure {
+    Failure::Setup { operation, source: Box::new(error) }
+}
+
 /// A rig that cannot be opened, as a failure of the command.
 pub fn rig_failure(error: RigError) -> Failure {
     match error {
+        error @ RigError::Sim(_) => setup("set up the rig", error),
         RigError::Device(source) => Failure::Device { operation: "open the devices", source },
         other => Failure::NoDevice { operation: "open the devices", message: other.to_string() },
     }

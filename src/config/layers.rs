@@ -13,6 +13,9 @@ use super::{Raw, Settings};
 /// The commented defaults, which are also the manual.
 const DEFAULTS: &str = include_str!("../../config/default.toml");
 
+/// The shipped rig: values to go on with where `[sim]` has a fault.
+const TWIN: &str = include_str!("../../config/sim.toml");
+
 /// Bound on the faults that one configuration can report.
 const MOST_FAULTS: usize = 200;
 
@@ -63,6 +66,8 @@ pub struct Override {
     pub key: String,
     /// Value.
     pub value: Value,
+    /// The text that `value` was read from, where it was text.
+    pub text: Option<String>,
     /// Variable or flag, for messages.
     pub origin: String,
 }
@@ -70,7 +75,7 @@ pub struct Override {
 impl Override {
     /// An override by a command-line flag.
     pub fn flag(name: &str, key: &str, value: impl Into<Value>) -> Self {
-        Self { key: key.into(), value: value.into(), origin: format!("flag {name}") }
+        Self { key: key.into(), value: value.into(), text: None, origin: format!("flag {name}") }
     }
 
     /// The overrides among environment variables: those that start with `POLSCAN_` and hold two underscores.
@@ -79,7 +84,8 @@ impl Override {
             .filter_map(|(name, text)| {
                 let (table, key) = name.strip_prefix("POLSCAN_")?.split_once("__")?;
                 let key = format!("{table}.{}", key.replace("__", ".")).to_lowercase();
-                Some(Self { key, value: value_of_text(&text), origin: format!("variable {name}") })
+                let value = value_of_text(&text);
+                Some(Self { key, value, text: Some(text), origin: format!("variable {name}") })
             })
             .collect();
         found.sort_by(|a, b| a.key.cmp(&b.key));
@@ -116,7 +122,12 @@ impl Layers {
             }
         }
         for change in &self.overrides {
-            if let Err(message) = set(&mut table, &change.key, change.value.clone()) {
+            // A serial number of digits only is text all the same.
+            let value = match (get(&table, &change.key), &change.text) {
+                (Some(Value::String(_)), Some(text)) => Value::String(text.clone()),
+                _ => change.value.clone(),
+            };
+            if let Err(message) = set(&mut table, &change.key, value) {
                 faults.push(Fault { key: change.key.clone(), message, origin: Some(change.origin.clone()) });
             }
         }
@@ -144,29 +155,31 @@ impl Layers {
         self.overrides.iter().rev().find(|change| change.key == key).map(|change| change.origin.clone())
     }
 
-    /// Deserializes the table; each faulty key is reported, put back to its default or removed, and the rest tried again.
+    /// Deserializes the table; each faulty key is reported, put back to a sound value or removed, and the rest tried again.
     fn deserialize(&self, mut table: Table, faults: &mut Vec<Fault>) -> Option<Raw> {
+        let sound = sound_values();
         for _ in 0..MOST_FAULTS {
             let error = match serde_path_to_error::deserialize::<_, Raw>(Value::Table(table.clone())) {
                 Ok(raw) => return Some(raw),
                 Err(error) => error,
             };
-            let key = error.path().to_string();
+            let mut path = keys(error.path());
             let message = error.inner().to_string().lines().next().unwrap_or_default().trim().to_string();
-            let default = get(&defaults(), &key).cloned();
-            let origin = self.origin_of(&key);
-            let unknown = default.is_none();
-            if faults.iter().any(|fault| missing_field(&message, &key).is_some_and(|path| path == fault.key))
+            if let Some(field) =
+                message.strip_prefix("missing field `").and_then(|rest| rest.strip_suffix('`'))
             {
-                return None;
+                path.push(field.into());
             }
-            faults.push(Fault { key: key.clone(), message, origin });
-            let mended = match default {
-                Some(default) if get(&table, &key) != Some(&default) => {
-                    set(&mut table, &key, default).is_ok()
+            let key = path.join(".");
+            let origin = self.origin_of(&key);
+            faults.push(Fault { key, message, origin });
+            // An element of a list is put back with its whole list: the nearest key that has a sound value.
+            let mended = (1..=path.len()).rev().any(|depth| match lookup(&sound, &path[..depth]) {
+                Some(value) if lookup(&table, &path[..depth]) != Some(value) => {
+                    put(&mut table, &path[..depth], value.clone())
                 }
-                _ => unknown && remove(&mut table, &key),
-            };
+                _ => depth == path.len() && take(&mut table, &path),
+            });
             if !mended {
                 return None;
             }
@@ -175,10 +188,54 @@ impl Layers {
     }
 }
 
-/// Path of the field that serde found missing in the table at `key`.
-fn missing_field(message: &str, key: &str) -> Option<String> {
-    let field = message.strip_prefix("missing field `")?.strip_suffix('`')?;
-    Some(if key == "." { field.into() } else { format!("{key}.{field}") })
+/// The keys of a path; an index into a list belongs to the list's key.
+fn keys(path: &serde_path_to_error::Path) -> Vec<String> {
+    path.iter()
+        .filter_map(|segment| match segment {
+            serde_path_to_error::Segment::Map { key } => Some(key.clone()),
+            _ => None,
+        })
+        .collect()
+}
+
+/// A table in which every key that can be wrong has a sound value: the defaults, and the shipped rig below `sim`.
+fn sound_values() -> Table {
+    let mut table = defaults();
+    if let Ok(mut twin) = toml::from_str::<Table>(TWIN)
+        && let Some(sim) = twin.remove("sim")
+    {
+        table.insert("sim".into(), sim);
+    }
+    table
+}
+
+fn lookup<'a>(table: &'a Table, path: &[String]) -> Option<&'a Value> {
+    let (first, rest) = path.split_first()?;
+    rest.iter().try_fold(table.get(first)?, |value, part| value.as_table()?.get(part))
+}
+
+fn put(table: &mut Table, path: &[String], value: Value) -> bool {
+    match path {
+        [] => false,
+        [key] => {
+            table.insert(key.clone(), value);
+            true
+        }
+        [head, rest @ ..] => {
+            let inner = table.entry(head).or_insert_with(|| Value::Table(Table::new()));
+            inner.as_table_mut().is_some_and(|inner| put(inner, rest, value))
+        }
+    }
+}
+
+fn take(table: &mut Table, path: &[String]) -> bool {
+    match path {
+        [] => false,
+        [key] => table.remove(key).is_some(),
+        [head, rest @ ..] => {
+            table.get_mut(head).and_then(Value::as_table_mut).is_some_and(|inner| take(inner, rest))
+        }
+    }
 }
 
 fn defaults() -> Table {
@@ -228,15 +285,6 @@ fn set(table: &mut Table, key: &str, value: Value) -> Result<(), String> {
             .as_table_mut()
             .ok_or_else(|| format!("`{head}` is a value, not a table"))
             .and_then(|inner| set(inner, rest, value)),
-    }
-}
-
-fn remove(table: &mut Table, key: &str) -> bool {
-    match key.split_once('.') {
-        None => table.remove(key).is_some(),
-        Some((head, rest)) => {
-            table.get_mut(head).and_then(Value::as_table_mut).is_some_and(|inner| remove(inner, rest))
-        }
     }
 }
 
@@ -309,10 +357,48 @@ mod tests {
     }
 
     #[test]
+    fn faults_below_sim_and_keys_with_dots_hide_no_others() {
+        let twin = include_str!("../../config/sim.toml");
+        let file = twin
+            .replace("size = [1600, 1200]", "size = [0, 3]\n\"od.d\" = 1")
+            .replace("focal_px = 4638.0", "focal_px = \"x\"")
+            .replace("latency_refreshes = 2", "latency_refreshes = -2")
+            .replace("near_mm = 700.0", "near_mm = 7000.0");
+        let mut faults = load(&format!("typo = 1\n{file}"), Vec::new()).unwrap_err();
+        faults.sort();
+        let expected = [
+            "rig.calibration",
+            "sim.camera.focal_px",
+            "sim.camera.od.d",
+            "sim.camera.size",
+            "sim.projector.latency_refreshes",
+            "sim.scene",
+            "typo",
+            "volume.far_mm",
+        ];
+        assert_eq!(faults, expected);
+    }
+
+    #[test]
     fn unknown_variables_of_our_form_are_errors_and_others_are_ignored() {
         assert_eq!(load("", variable("POLSCAN_SCAN__MOOD", "gray")).unwrap_err(), ["scan.mood"]);
         assert!(load("", variable("POLSCAN_LOG", "debug")).is_ok());
         assert!(load("", variable("OTHER__THING", "1")).is_ok());
+    }
+
+    #[test]
+    fn a_text_of_digits_stays_text() {
+        let settings = load("", variable("POLSCAN_CAMERA__SERIAL", "12345678")).unwrap();
+        assert_eq!(settings.raw.camera.serial, "12345678");
+        let settings = load("", variable("POLSCAN_RIG__NAME", "\"seven\"")).unwrap();
+        assert_eq!(settings.raw.rig.name, "\"seven\"");
+    }
+
+    #[test]
+    fn defaults_of_file_and_code_agree() {
+        let settings = Layers::default().load().unwrap();
+        assert_eq!(settings.thresholds, crate::decode::Thresholds::default());
+        assert_eq!(settings.raw.decode.row_gate_px, crate::cloud::DEFAULT_ROW_GATE_PX);
     }
 
     #[test]

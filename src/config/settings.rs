@@ -89,7 +89,7 @@ fn check_ranges(raw: &Raw, faults: &mut Faults) {
     within("capture.retakes_per_pair", f64::from(raw.capture.retakes_per_pair), 0.0, 100.0, "");
     within("capture.retakes_per_scan", f64::from(raw.capture.retakes_per_scan), 0.0, 1000.0, "");
     within("decode.lit_sigma", raw.decode.lit_sigma, 1.0, 100.0, " sigma");
-    within("decode.soft_bit_sigma", raw.decode.soft_bit_sigma, 0.0, 100.0, " sigma");
+    within("decode.soft_bit_sigma", raw.decode.soft_bit_sigma, 0.1, 100.0, " sigma");
     within("decode.snap_px", raw.decode.snap_px, 0.5, 16.0, " px");
     within("decode.fit_edges", raw.decode.fit_edges as f64, 2.0, 64.0, " edges");
     within("decode.row_gate_px", raw.decode.row_gate_px, 0.1, 1000.0, " px");

@@ -4,12 +4,14 @@ use polscan_patterns::{Axis, Mode, Role};
 
 use super::{
     contrast::{Contrast, contrast},
-    gates, noise, pair_sum,
+    gates,
+    limits::Gates,
+    noise, pair_sum,
     plan::{Frames, plan, reference_roles},
     sample::Sample,
     subpixel,
     types::{Class, DecodeError, DecodeSettings, Decoded, Plane, SharedPlane},
-    words::{Gates, PixelMaps, decode_pixels},
+    words::{PixelMaps, decode_pixels},
 };
 use crate::grid::Grid;
 

@@ -25,6 +25,9 @@ use super::{
     words::{PixelMaps, WEAK_SCALE, WEAK_UNKNOWN},
 };
 
+/// Dissenting neighbours that outvote a single supporter: more than the four that the end of a line one pixel wide has
+/// where it meets the rim of the image.
+const DISSENTERS: usize = 5;
 /// How far a side's direction is followed, in px.
 const SLOPE_REACH: usize = 16;
 /// Illegal crossings that make a bit suspect, at least.
@@ -43,12 +46,38 @@ pub struct BoundaryCheck {
     pub legal: u64,
     /// Crossings of this bit alone where it has no boundary.
     pub illegal: u64,
+    /// Legal crossings along the axis' direction that run against the way in which its values run as a whole.
+    pub against: u64,
 }
 
 impl BoundaryCheck {
-    /// Whether the pair of this bit (or the frames around it) cannot be what was projected.
+    /// Whether the frames of this bit or of the next finer one cannot be what was projected: exchanged, or another
+    /// pair's. Of the finest bit an exchange moves codes by one only, which no boundary shows; but its crossings then
+    /// run against all others.
     pub fn is_suspect(&self) -> bool {
-        self.illegal >= SUSPECT_CROSSINGS && self.illegal > self.legal
+        let misplaced = self.illegal >= SUSPECT_CROSSINGS && self.illegal > self.legal;
+        misplaced || (self.against >= SUSPECT_CROSSINGS && 2 * self.against > self.legal)
+    }
+}
+
+/// Crossings of one bit.
+#[derive(Debug, Clone, Copy, Default)]
+struct Crossings {
+    legal: u64,
+    illegal: u64,
+    rising: u64,
+    falling: u64,
+    /// Sum of the steps of legal crossings along the axis' direction.
+    travel: i64,
+}
+
+impl Crossings {
+    fn add(&mut self, other: Self) {
+        self.legal += other.legal;
+        self.illegal += other.illegal;
+        self.rising += other.rising;
+        self.falling += other.falling;
+        self.travel += other.travel;
     }
 }
 
@@ -84,8 +113,12 @@ pub(crate) fn apply<T: Sync>(
         let snap = (2.0 * thresholds.snap_px / f64::from(1u32 << axis.code.shift)).floor() as i32;
         let shape = axis_shape(values, width, height, snap);
         let mut view = AxisView { values, width, height, shape, suspect: 0 };
-        for (bit, (legal, illegal)) in view.count_crossings(axis.code.bits).into_iter().enumerate() {
-            let check = BoundaryCheck { axis: axis.axis, bit: bit as u8, legal, illegal };
+        let crossings = view.count_crossings(axis.code.bits);
+        let rises = crossings.iter().map(|crossing| crossing.travel).sum::<i64>() >= 0;
+        for (bit, crossing) in crossings.into_iter().enumerate() {
+            let Crossings { legal, illegal, rising, falling, .. } = crossing;
+            let against = if rises { falling } else { rising };
+            let check = BoundaryCheck { axis: axis.axis, bit: bit as u8, legal, illegal, against };
             if check.is_suspect() {
                 view.suspect |= 1 << (usize::from(axis.code.bits) - 1 - bit);
             }
@@ -102,10 +135,10 @@ pub(crate) fn apply<T: Sync>(
                 continue;
             }
             let weakest = maps.weakest[y * width + x];
-            if weakest != WEAK_UNKNOWN && f32::from(weakest) < weak_below {
-                *class = Class::Interreflection;
-            } else if views.iter().any(|view| view.is_off_boundary(x, y)) {
+            if views.iter().any(|view| view.is_off_boundary(x, y)) {
                 *class = Class::OffBoundary;
+            } else if weakest != WEAK_UNKNOWN && f32::from(weakest) < weak_below {
+                *class = Class::Interreflection;
             }
         }
     });
@@ -190,42 +223,49 @@ fn gray(value: i32) -> u32 {
 }
 
 impl AxisView<'_> {
-    /// Legal and illegal crossings of each bit.
-    fn count_crossings(&self, bits: u8) -> Vec<(u64, u64)> {
+    /// Crossings of each bit.
+    fn count_crossings(&self, bits: u8) -> Vec<Crossings> {
         let bits = usize::from(bits);
-        let zero = || vec![(0u64, 0u64); bits];
+        let zero = || vec![Crossings::default(); bits];
         (0..self.height)
             .into_par_iter()
             .map(|y| {
                 let mut counts = zero();
-                let mut count = |here: i32, there: i32| {
-                    if here < 0 || there < 0 || here == there {
-                        return;
-                    }
-                    let mut changed = gray(here) ^ gray(there);
-                    let legal = here.abs_diff(there) as i32 <= self.shape.step;
-                    if !legal && changed.count_ones() > 1 {
-                        return;
-                    }
-                    while changed != 0 {
-                        let entry = &mut counts[bits - 1 - changed.trailing_zeros() as usize];
-                        if legal {
-                            entry.0 += 1;
-                        } else {
-                            entry.1 += 1;
-                        }
-                        changed &= changed - 1;
-                    }
-                };
                 let row = &self.values[y * self.width..][..self.width];
-                row.windows(2).for_each(|two| count(two[0], two[1]));
+                row.windows(2).for_each(|two| self.count(two[0], two[1], !self.shape.along_y, &mut counts));
                 if y + 1 < self.height {
                     let next = &self.values[(y + 1) * self.width..][..self.width];
-                    row.iter().zip(next).for_each(|(&here, &there)| count(here, there));
+                    let down = row.iter().zip(next);
+                    down.for_each(|(&here, &there)| self.count(here, there, self.shape.along_y, &mut counts));
                 }
                 counts
             })
-            .reduce(zero, |a, b| a.iter().zip(&b).map(|(a, b)| (a.0 + b.0, a.1 + b.1)).collect())
+            .reduce(zero, |mut sum, more| {
+                sum.iter_mut().zip(more).for_each(|(sum, more)| sum.add(more));
+                sum
+            })
+    }
+
+    fn count(&self, here: i32, there: i32, along: bool, counts: &mut [Crossings]) {
+        if here < 0 || there < 0 || here == there {
+            return;
+        }
+        let mut changed = gray(here) ^ gray(there);
+        let legal = here.abs_diff(there) as i32 <= self.shape.step;
+        if !legal && changed.count_ones() > 1 {
+            return;
+        }
+        while changed != 0 {
+            let entry = &mut counts[counts.len() - 1 - changed.trailing_zeros() as usize];
+            entry.add(Crossings {
+                legal: u64::from(legal),
+                illegal: u64::from(!legal),
+                rising: u64::from(legal && along && there > here),
+                falling: u64::from(legal && along && there < here),
+                travel: if legal && along { i64::from(there - here) } else { 0 },
+            });
+            changed &= changed - 1;
+        }
     }
 
     /// Whether a crossing between this valid pixel and one of its four neighbours is where no boundary can be.
@@ -283,7 +323,7 @@ impl AxisView<'_> {
     }
 }
 
-/// Whether too few of the eight neighbours support a pixel: none, or one against at least three that dissent.
+/// Whether too few of the eight neighbours support a pixel: none, or one against many that dissent.
 fn is_outvoted(class: &[Class], views: &[AxisView<'_>], x: usize, y: usize) -> bool {
     let Some(view) = views.first() else { return false };
     let (width, height) = (view.width, view.height);
@@ -308,5 +348,5 @@ fn is_outvoted(class: &[Class], views: &[AxisView<'_>], x: usize, y: usize) -> b
             }
         }
     }
-    supporters == 0 || (supporters == 1 && dissenters >= 3)
+    supporters == 0 || (supporters == 1 && dissenters >= DISSENTERS)
 }

@@ -6,7 +6,11 @@
 mod accumulate;
 mod contrast;
 mod gates;
+mod kernels;
+mod limits;
 mod noise;
+#[cfg(test)]
+mod oracle;
 mod pair_sum;
 mod plan;
 mod sample;

@@ -186,7 +186,8 @@ fn fit(points: &[(f64, f64, f64)]) -> Option<NoiseModel> {
             wlv += weight * level * variance;
         }
         let determinant = w * wll - wl * wl;
-        (offset, slope) = if determinant > 1e-9 * w * wll {
+        // Levels that differ by less than about 5 % cannot tell read noise from shot noise.
+        (offset, slope) = if determinant > 0.003 * w * wll {
             ((wll * wv - wl * wlv) / determinant, (w * wlv - wl * wv) / determinant)
         } else {
             (wv / w, 0.0)

@@ -21,6 +21,8 @@ pub(crate) enum BitFrames<'a, T> {
 pub(crate) struct AxisFrames<'a, T> {
     pub axis: Axis,
     pub code: PrefixCode,
+    /// Value of each word, -1 outside the projector.
+    pub values: Vec<i32>,
     pub bits: Vec<BitFrames<'a, T>>,
 }
 
@@ -171,7 +173,9 @@ pub(crate) fn plan<'a, T: Sample>(
             continue;
         }
         tell_losses(axis, code, &found, bits.len(), &mut losses);
-        axes.push(AxisFrames { axis, code: PrefixCode::new(code, bits.len() as u8), bits });
+        let code = PrefixCode::new(code, bits.len() as u8);
+        let values = (0..1u32 << code.bits).map(|word| code.value(word as u16).unwrap_or(-1)).collect();
+        axes.push(AxisFrames { axis, code, values, bits });
     }
     let levels = match (high.is_empty(), low.is_empty()) {
         _ if mode == Mode::Paper => Levels::Pairs,

@@ -85,6 +85,26 @@ impl Default for Thresholds {
     }
 }
 
+impl Thresholds {
+    /// Each gate that lies outside its range: its name, and what is wrong with it.
+    pub fn faults(&self) -> Vec<(&'static str, String)> {
+        let within = |key, value: f64, range: std::ops::RangeInclusive<f64>, unit: &str| {
+            // NaN lies in no range.
+            let (least, most) = (*range.start(), *range.end());
+            (!range.contains(&value)).then(|| (key, format!("is {value}, expected {least} to {most}{unit}")))
+        };
+        [
+            within("lit_sigma", self.lit_sigma, 1.0..=100.0, " sigma"),
+            within("soft_bit_sigma", self.soft_bit_sigma, 0.1..=100.0, " sigma"),
+            within("snap_px", self.snap_px, 0.5..=16.0, " px"),
+            within("fit_edges", self.fit_edges as f64, 2.0..=64.0, " edges"),
+        ]
+        .into_iter()
+        .flatten()
+        .collect()
+    }
+}
+
 /// Everything that fixes a decode besides the frames themselves.
 #[derive(Debug, Clone, PartialEq)]
 pub struct DecodeSettings {

@@ -13,9 +13,11 @@ use polscan_patterns::Mode;
 use rayon::prelude::*;
 
 use super::{
+    kernels::{WEAK_BIT_SHIFT, pair_bit, pair_sum, track_weakest},
+    limits::Gates,
     plan::{AxisFrames, BitFrames, Frames, Levels, PrefixCode},
     sample::Sample,
-    types::{CameraResponse, Class, DecodeSettings, NoiseModel},
+    types::Class,
 };
 
 /// Bits whose boundaries lie at least this far apart (in values) are coarse: the pattern is flat between them.
@@ -27,61 +29,6 @@ const WEAK_JUDGED: f32 = 9.0;
 /// Scale of the stored weakness; `WEAK_UNKNOWN` where it is not judged.
 pub(crate) const WEAK_SCALE: f32 = 128.0;
 pub(crate) const WEAK_UNKNOWN: u8 = u8::MAX;
-
-/// Everything that is fixed for a decode.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct Gates {
-    pub mode: Mode,
-    pub noise: NoiseModel,
-    pub black_dn: f32,
-    pub saturation_dn: i32,
-    pub lit_sigma: f32,
-    pub soft_sigma: f32,
-    pub full_scale_dn: f32,
-}
-
-impl Gates {
-    pub fn new(settings: &DecodeSettings, noise: NoiseModel) -> Self {
-        Self {
-            mode: settings.mode,
-            noise,
-            black_dn: settings.camera.black_level_dn.unwrap_or(0.0) as f32,
-            saturation_dn: i32::from(settings.camera.saturation_dn),
-            lit_sigma: settings.thresholds.lit_sigma as f32,
-            soft_sigma: settings.thresholds.soft_bit_sigma as f32,
-            full_scale_dn: ((1u32 << settings.camera.bit_depth) - 1) as f32,
-        }
-    }
-
-    /// What a check of a single pair needs.
-    pub fn for_check(camera: CameraResponse, noise: NoiseModel, lit_sigma: f64) -> Self {
-        Self {
-            mode: Mode::Pse,
-            noise,
-            black_dn: camera.black_level_dn.unwrap_or(0.0) as f32,
-            saturation_dn: i32::from(camera.saturation_dn),
-            lit_sigma: lit_sigma as f32,
-            soft_sigma: 0.0,
-            full_scale_dn: 1.0,
-        }
-    }
-
-    /// Variance of one sample at `dn`.
-    pub fn variance(&self, dn: f32) -> f32 {
-        self.fixed_variance() + self.noise.gain_dn_per_electron as f32 * (dn - self.black_dn).max(0.0)
-    }
-
-    fn fixed_variance(&self) -> f32 {
-        (self.noise.read_noise_dn * self.noise.read_noise_dn + 1.0 / 12.0) as f32
-    }
-
-    /// Degree of linear polarization of a sample against the dark reference, both in DN (Eq. 5): 0 where their sum is
-    /// not positive after dark subtraction.
-    pub fn dolp(&self, dn: f32, dark_dn: f32) -> f32 {
-        let sum = dn + dark_dn - 2.0 * self.black_dn;
-        if sum > 0.0 { (dn - dark_dn) / sum } else { 0.0 }
-    }
-}
 
 /// One image of every per-pixel result.
 pub(crate) struct PixelMaps {
@@ -368,9 +315,9 @@ impl Scratch {
         weak: &mut [f32],
     ) {
         let mask = ((1u32 << axis.code.bits) - 1) as u16;
-        for x in 0..self.word.len() {
+        for (x, weak) in weak.iter_mut().enumerate() {
             let word = (self.word[x] ^ self.inverted[x]) & mask;
-            let (value, status) = resolve_word(axis.code, word, self.soft[x]);
+            let (value, status) = resolve_word(&axis.values, word, self.soft[x]);
             row.words[index][x] = word;
             row.values[index][x] = value;
             self.status[x] = self.status[x].max(status);
@@ -379,7 +326,7 @@ impl Scratch {
                 let near = boundary_distance(axis.code, bit, value) <= EDGE_REACH;
                 let key = if near { self.second[x] } else { self.weakest[x] };
                 if key != i32::MAX {
-                    weak[x] = weak[x].min((key >> WEAK_BIT_SHIFT) as f32);
+                    *weak = weak.min((key >> WEAK_BIT_SHIFT) as f32);
                 }
             }
         }
@@ -387,7 +334,7 @@ impl Scratch {
 
     fn classify<T>(&self, frames: &Frames<'_, T>, gates: &Gates, row: &mut RowMaps<'_>, weak: &[f32]) {
         let pair_count = frames.pair_count() as f32;
-        for x in 0..weak.len() {
+        for (x, &weak) in weak.iter().enumerate() {
             let modulation = row.modulation[x].abs();
             let inverted = self.inverted[x] != 0;
             let gate = if inverted { 2.0 * gates.lit_sigma } else { gates.lit_sigma };
@@ -416,11 +363,11 @@ impl Scratch {
             }
             let sigma = row.sigma[x];
             if class.is_valid()
-                && weak[x].is_finite()
+                && weak.is_finite()
                 && self.saturated[x] == 0
                 && modulation >= WEAK_JUDGED * sigma
             {
-                row.weakest[x] = (weak[x] / modulation * WEAK_SCALE).min(254.0) as u8;
+                row.weakest[x] = (weak / modulation * WEAK_SCALE).min(254.0) as u8;
             }
             if self.pairs[x] > 0 && self.saturated[x] & 4 == 0 {
                 let variance = match frames.levels {
@@ -433,64 +380,15 @@ impl Scratch {
     }
 }
 
-// The kernels of the inner loops are functions of slices: that no two of them overlap is then known to the compiler,
-// which vectorises the loops.
-
-/// Bit of a pair by the sign of its difference.
-fn pair_bit<T: Sample>(
-    p: &[T],
-    q: &[T],
-    full: i32,
-    soft_at: &[i32],
-    word: &mut [u16],
-    soft: &mut [u16],
-    saturated: &mut [u8],
-) {
-    let width = p.len();
-    let (q, soft_at) = (&q[..width], &soft_at[..width]);
-    let (word, soft, saturated) = (&mut word[..width], &mut soft[..width], &mut saturated[..width]);
-    for x in 0..width {
-        let (p, q) = (p[x].dn(), q[x].dn());
-        word[x] = (word[x] << 1) | u16::from(p > q);
-        soft[x] = (soft[x] << 1) | u16::from((p - q).abs() <= soft_at[x]);
-        saturated[x] |= u8::from(p.max(q) >= full) | (u8::from(p.min(q) >= full) << 1);
+/// Value of a word (`values` by word, negative outside the projector) with at most one soft bit. A single soft bit is an edge where both readings are neighbours.
+fn resolve_word(values: &[i32], word: u16, soft: u16) -> (i32, Status) {
+    let read = values[usize::from(word)];
+    if soft == 0 {
+        return (read, if read < 0 { Status::Outside } else { Status::Clear });
     }
-}
-
-/// Collects the residual of the pair sum where no frame of the pair is saturated.
-fn pair_sum<T: Sample>(p: &[T], q: &[T], full: i32, sums: &[f32], squares: &mut [f32], pairs: &mut [u32]) {
-    let width = p.len();
-    let (q, sums) = (&q[..width], &sums[..width]);
-    let (squares, pairs) = (&mut squares[..width], &mut pairs[..width]);
-    for x in 0..width {
-        let (p, q) = (p[x].dn(), q[x].dn());
-        let free = i32::from(p.max(q) < full);
-        let residual = ((p + q) as f32 - sums[x]) * free as f32;
-        squares[x] += residual * residual;
-        pairs[x] += free as u32;
-    }
-}
-
-/// Keeps the two smallest |P - Q| of the coarse bits (at most one of them is near its own edge), each with its bit.
-fn track_weakest<T: Sample>(p: &[T], q: &[T], bit: u8, weakest: &mut [i32], second: &mut [i32]) {
-    let width = p.len();
-    let (q, weakest, second) = (&q[..width], &mut weakest[..width], &mut second[..width]);
-    for x in 0..width {
-        let key = ((p[x].dn() - q[x].dn()).abs() << WEAK_BIT_SHIFT) | i32::from(bit);
-        second[x] = second[x].min(weakest[x].max(key));
-        weakest[x] = weakest[x].min(key);
-    }
-}
-
-/// Bits of a key of [`track_weakest`] that hold the bit's number.
-const WEAK_BIT_SHIFT: u32 = 5;
-
-/// Value of a word with at most one soft bit. A single soft bit is an edge where both readings are neighbours.
-fn resolve_word(code: PrefixCode, word: u16, soft: u16) -> (i32, Status) {
-    let value = code.value(word);
+    let inside = |value: i32| (value >= 0).then_some(value);
     match soft.count_ones() {
-        0 => value.map_or((-1, Status::Outside), |value| (value, Status::Clear)),
-        1 => match (value, code.value(word ^ soft)) {
+        1 => match (inside(read), inside(values[usize::from(word ^ soft)])) {
             (Some(one), Some(other)) if one.abs_diff(other) == 1 => (one, Status::Edge),
             (Some(_), Some(_)) => (-1, Status::Ambiguous),
             // At the rim of the projector only one reading exists.

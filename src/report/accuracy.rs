@@ -24,7 +24,7 @@ pub struct Accuracy {
     pub pixels: u64,
     /// Of those, pixels with a measurement.
     pub valid: u64,
-    /// Of the valid ones, those whose column is off by more than [`WRONG_COLUMN`].
+    /// Of the valid ones, those whose column is off by more than 1.5.
     pub wrong: u64,
     /// `valid / pixels`.
     pub coverage: Option<f64>,

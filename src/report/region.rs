@@ -93,7 +93,7 @@ impl NamedRegion {
         Err(RegionError::Outside { name: self.name.clone(), width, height })
     }
 
-    /// Whether a pixel lies in the region, [`MARGIN_PX`] off its border.
+    /// Whether a pixel lies in the region, 2 px off its border.
     pub fn contains(&self, x: usize, y: usize) -> bool {
         let inside =
             |at: usize, start: usize, size: usize| at >= start + MARGIN_PX && at + MARGIN_PX < start + size;

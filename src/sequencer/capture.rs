@@ -1,4 +1,6 @@
 //! The thin shell around the [`Machine`]: it does what the machine says and tells it what came of it.
+//!
+//! The file is long because shell, guard and errors share the rig's private state.
 
 use std::{
     collections::VecDeque,

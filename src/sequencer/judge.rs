@@ -64,6 +64,9 @@ pub struct PairThresholds {
     pub stale_gain: f64,
     /// Share of edge pixels beyond 5 sigma that is called a non-linear response.
     pub edge_outliers: f64,
+    /// How many times more outliers at edges than on flat areas speak of the response rather than of a change: blur
+    /// carries what happens at an edge a little beyond the pixels that count as near it.
+    pub edge_ratio: f64,
     /// Common brightness change that is reported.
     pub median_degraded: f64,
     /// Common brightness change that asks for a re-take.
@@ -83,6 +86,7 @@ impl Default for PairThresholds {
             motion_share: 0.02,
             stale_gain: 0.3,
             edge_outliers: 0.02,
+            edge_ratio: 10.0,
             median_degraded: 1.0,
             median_retake: 3.0,
             sigma: 1.5,
@@ -109,16 +113,19 @@ pub fn judge_rule(residual: &PairResidual, code_bits: u8, thresholds: &PairThres
     }
     // The finest bits have hardly a flat pixel: NaN, no share of nothing, counts as none.
     let (flat, edge) = (flat_outliers.max(0.0), edge_outliers.max(0.0));
-    if median.abs() >= thresholds.median_retake {
+    let fine = bit + thresholds.fine_bits >= code_bits;
+    // Edges cover most of the image in the fine bits, so that a curved response shifts their median too.
+    if median.abs() >= thresholds.median_retake && !(fine && edge >= thresholds.edge_outliers) {
         let cause = "the whole image changed its brightness";
         return PairVerdict::Retake(suspicion("flicker", cause));
     }
-    let fine = bit + thresholds.fine_bits >= code_bits;
     if flat >= thresholds.stale_share {
         let cause = "a large part of the image shows another picture";
         return PairVerdict::Retake(suspicion("stale-frame", cause));
     }
-    if flat >= thresholds.flat_outliers && !fine {
+    // Light that changed in a part of the image changed at stripe edges and off them alike.
+    let at_edges_only = edge >= thresholds.edge_outliers && flat * thresholds.edge_ratio <= edge;
+    if flat >= thresholds.flat_outliers && !fine && !at_edges_only {
         return PairVerdict::Retake(match flat < thresholds.motion_share {
             true => suspicion("motion", "a small part of the image changed between the frames"),
             false => suspicion("torn-frame", "a part of the image shows another picture"),

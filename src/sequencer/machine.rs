@@ -1,5 +1,7 @@
 //! What a capture does next: events in, actions out. No device, no clock, no thread; time is an argument.
 //!
+//! The file is long because diagram, states and transitions are read together.
+//!
 //! ```text
 //!                                   verdict on the pair before
 //!                                        ^          |

@@ -12,7 +12,7 @@ use rayon::prelude::*;
 use sha2::{Digest, Sha256};
 
 use super::{
-    error::InputError,
+    error::{Fault, Faults, InputError},
     images::{self, Info, Reduction, Samples},
     manifest::{self, FileEntry, FrameFiles, Manifest, SourceFile, full_scale},
     npy::{Dtype, Header},
@@ -160,6 +160,10 @@ fn check_levels(path: &Path, manifest: &Manifest, set: &mut FrameSet) -> Result<
         );
         return Err(InputError::content(path, detail));
     }
+    let levels = level_faults(manifest, bit_depth);
+    if !levels.is_empty() {
+        return Err(InputError::Manifest { path: path.to_owned(), faults: Faults(levels) });
+    }
     let brightest: Vec<u16> = set.planes.par_iter().map(|plane| brightest(plane.plane())).collect();
     let top = full_scale(bit_depth);
     if let Some(index) = brightest.iter().position(|&level| level > top) {
@@ -179,6 +183,20 @@ fn check_levels(path: &Path, manifest: &Manifest, set: &mut FrameSet) -> Result<
         ));
     }
     Ok(())
+}
+
+/// Levels of the manifest that no sample of `bit_depth` reaches. Without its own bit depth a manifest tells them only
+/// together with the frames.
+fn level_faults(manifest: &Manifest, bit_depth: u8) -> Vec<Fault> {
+    let camera = manifest.camera.unwrap_or_default();
+    let top = full_scale(bit_depth);
+    let given = [("saturation", camera.saturation.map(f64::from)), ("black_level", camera.black_level)];
+    let beyond = |(key, level): (&str, Option<f64>)| {
+        let level = level.filter(|&level| level > f64::from(top))?;
+        let message = format!("is {level} DN, the samples have {bit_depth} bits and end at {top}");
+        Some(Fault::new(format!("camera.{key}"), message))
+    };
+    given.into_iter().filter_map(beyond).collect()
 }
 
 fn brightest(plane: Plane<'_>) -> u16 {

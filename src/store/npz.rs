@@ -115,7 +115,7 @@ impl Arrays {
     }
 }
 
-/// Reads all arrays of an archive as [`write`] makes it: stored, of two dimensions. The error is a sentence that
+/// Reads all arrays of an archive as [`write`](fn@write) makes it: stored, of two dimensions. The error is a sentence that
 /// follows the file's name.
 pub fn read(file: impl Read + Seek) -> Result<Arrays, String> {
     let mut zip = ZipArchive::new(file).map_err(|error| format!("is not a .npz: {error}"))?;

@@ -10,6 +10,7 @@ use std::{
 use polscan_patterns::Mode;
 use rayon::prelude::*;
 use sha2::{Digest, Sha256};
+use thiserror::Error;
 
 use super::{
     error::{Fault, Faults, InputError},
@@ -17,13 +18,16 @@ use super::{
     manifest::{self, FileEntry, Manifest, Source, path_fault},
     npz,
 };
-use crate::truth::Truth;
+use crate::{
+    geometry::{self, Calibration, CalibrationError, ReadHints},
+    truth::Truth,
+};
 
 /// Longest manifest that is read, in bytes.
 const MAX_MANIFEST_BYTES: u64 = 32 << 20;
 
-/// Longest calibration file that is read, in bytes: toolbox results hold all their corners.
-const MAX_CALIBRATION_BYTES: u64 = 256 << 20;
+/// What the array `object` of the truth holds where there is none.
+const NO_OBJECT: u8 = 255;
 
 /// How far a bundle is trusted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -101,12 +105,13 @@ impl Bundle {
     pub fn calibration(&self) -> Result<Option<(PathBuf, Vec<u8>)>, InputError> {
         let Some(name) = &self.manifest.calibration else { return Ok(None) };
         let path = self.resolve(name)?;
-        let bytes = read_bounded(&path, self.policy, "read calibration", MAX_CALIBRATION_BYTES)?;
+        let bytes = read_bounded(&path, self.policy, "read calibration", geometry::MAX_BYTES)?;
         Ok(Some((path, bytes)))
     }
 
-    /// What a simulated rig knew of its scene, if the bundle has it.
-    pub fn truth(&self) -> Result<Option<Truth>, InputError> {
+    /// What a simulated rig knew of its scene, if the bundle has it. Its arrays must have the `size` of the frames,
+    /// (width, height), and name only objects that the manifest lists.
+    pub fn truth(&self, size: (usize, usize)) -> Result<Option<Truth>, InputError> {
         let Some(objects) = &self.manifest.truth_objects else { return Ok(None) };
         let path = self.resolve(super::maps::TRUTH_FILE_NAME)?;
         let mut arrays = npz::read(&open_regular(&path, self.policy, "read truth")?)
@@ -114,12 +119,24 @@ impl Bundle {
         let mut floats = |name| arrays.take_f32(name).map_err(|detail| InputError::content(&path, detail));
         let (column, row, depth_mm) = (floats("column")?, floats("row")?, floats("depth")?);
         let object = arrays.take_u8("object").map_err(|detail| InputError::content(&path, detail))?;
-        let size = |width, height| (width, height) == (column.width(), column.height());
-        let same = size(row.width(), row.height())
-            && size(depth_mm.width(), depth_mm.height())
-            && size(object.width(), object.height());
-        if !same {
-            return Err(InputError::content(&path, "its arrays differ in size"));
+        let sizes = [
+            ("column", column.width(), column.height()),
+            ("row", row.width(), row.height()),
+            ("depth", depth_mm.width(), depth_mm.height()),
+            ("object", object.width(), object.height()),
+        ];
+        if let Some((name, width, height)) = sizes.into_iter().find(|&(_, w, h)| (w, h) != size) {
+            let detail =
+                format!("its `{name}` is {width} x {height}, the frames are {} x {}", size.0, size.1);
+            return Err(InputError::content(&path, detail));
+        }
+        let unknown = |&index: &u8| index != NO_OBJECT && usize::from(index) >= objects.len();
+        if let Some(index) = object.data().iter().copied().find(unknown) {
+            let detail = format!(
+                "its `object` holds {index}, the manifest's `truth_objects` lists {} (and {NO_OBJECT} means none)",
+                objects.len()
+            );
+            return Err(InputError::content(&path, detail));
         }
         Ok(Some(Truth { column, row, depth_mm, object, objects: objects.clone() }))
     }
@@ -234,6 +251,23 @@ pub(crate) fn read_bounded(
         ));
     }
     Ok(bytes)
+}
+
+/// A calibration file given by a person, in any format that is known.
+pub fn read_calibration(path: &Path, hints: &ReadHints) -> Result<Calibration, CalibrationFileError> {
+    let bytes = read_bounded(path, Policy::Local, "read calibration", geometry::MAX_BYTES)?;
+    Ok(Calibration::from_bytes(&bytes, &path.display().to_string(), hints)?)
+}
+
+/// Why a calibration cannot be had from a file.
+#[derive(Debug, Error)]
+pub enum CalibrationFileError {
+    /// It cannot be read.
+    #[error(transparent)]
+    Input(#[from] InputError),
+    /// Its content cannot be used.
+    #[error(transparent)]
+    Content(#[from] CalibrationError),
 }
 
 /// Length and hash of a file.

@@ -113,7 +113,7 @@ class Check:
             evidence = manifest.get("capture", {}).get("frames", [])
             self.expect(len(evidence) == len(manifest["sequence"]), "manifest: not one record for each frame")
             for index, frame in enumerate(evidence):
-                self.expect({"receipt", "triggered", "stamp"} <= set(frame), f"manifest: capture.frames[{index}]")
+                self.expect({"receipt", "triggered_ns", "stamp"} <= set(frame), f"manifest: capture.frames[{index}]")
 
     def files(self, manifest):
         listed = manifest.get("files", {})

@@ -23,6 +23,8 @@ const MODEL: &str = "simulated monochrome camera";
 const SHORTEST_EXPOSURE_US: f64 = 1.0;
 const LONGEST_EXPOSURE_US: f64 = 30e6;
 /// Exposure times are whole multiples of this.
+/// A clipped pixel reads this many sigma of read noise low once in some million samples.
+const SATURATION_MARGIN_SIGMA: f64 = 5.0;
 const EXPOSURE_STEP_US: f64 = 1.0;
 const HIGHEST_GAIN_DB: f64 = 48.0;
 
@@ -141,6 +143,14 @@ fn response(
     Response { region, bits, dn_per_electron, black_dn, gamma: camera.gamma, exposure_us }
 }
 
+/// Least value of a sample whose pixel may have been full. Read noise comes after the pixel is full, so that a clipped
+/// pixel reads a few sigma below the level of the full well.
+fn saturation_dn(camera: &CameraDescription, response: &Response) -> u16 {
+    let noise_dn = camera.read_noise_e * response.dn_per_electron;
+    let full_dn = f64::from(response.full_scale_dn());
+    (full_dn - (SATURATION_MARGIN_SIGMA * noise_dn).ceil()).max(1.0) as u16
+}
+
 impl Camera for SimCamera {
     fn info(&self) -> &CameraInfo {
         &self.info
@@ -177,7 +187,7 @@ impl Camera for SimCamera {
         let region = self.region(settings.region)?;
         let exposure_us = (exposure / EXPOSURE_STEP_US).round() * EXPOSURE_STEP_US;
         let response = response(camera, settings, region, exposure_us);
-        let noise = (camera.gamma == 1.0).then(|| CameraNoise {
+        let noise = (camera.gamma == 1.0).then_some(CameraNoise {
             gain_dn_per_electron: response.dn_per_electron,
             read_noise_dn: camera.read_noise_e * response.dn_per_electron,
         });
@@ -186,7 +196,7 @@ impl Camera for SimCamera {
             width: region.width,
             height: region.height,
             black_level_dn: Some(response.black_dn),
-            saturation_dn: response.full_scale_dn(),
+            saturation_dn: saturation_dn(camera, &response),
             readout_us: camera.readout_us,
             noise,
         };

@@ -8,7 +8,8 @@
 //! 2. *Time*: a picture is flipped at a refresh, its light follows after the latency, the liquid crystals follow
 //!    exponentially, the lamp may flicker; an exposure integrates all of it analytically into a weighted sum of slides.
 //! 3. *Scene*: per pixel one ray; the surface returns a GGX lobe by Fresnel's laws (as a Mueller matrix, complex index)
-//!    and a depolarising Lambertian part. Shadows are cast by a ray to the projector.
+//!    and a depolarising Lambertian part. Shadows are cast by a ray to the projector. Light is reflected once: what one
+//!    surface throws onto another (interreflection) is not modelled.
 //! 4. *Camera*: analyser, lens blur and pixel box, shot noise, full well, read noise, gain, black level, quantisation.
 //!
 //! Everything up to the panel's drive is linear and fixed, so it is computed once: a frame is a table look-up and a

@@ -265,7 +265,7 @@ impl Full {
         let mut light = [0.0f32; 4];
         let (u, v) = (self.panel.coordinate(column), self.panel.coordinate(row));
         let [width, height] = self.panel.size;
-        for channel in 0..3 {
+        for (channel, light) in light.iter_mut().take(3).enumerate() {
             let [dx, dy] = self.panel.shift_px[channel];
             let across = self.neighbours(u - dx, width);
             let down = self.neighbours(v - dy, height);
@@ -280,7 +280,7 @@ impl Full {
                 sum += wy * partial;
                 total += wy * share;
             }
-            light[channel] = if total > 1e-9 { sum / total } else { 0.0 };
+            *light = if total > 1e-9 { sum / total } else { 0.0 };
         }
         light
     }
@@ -411,10 +411,10 @@ mod tests {
             let position = [panel.position(0, u), panel.position(1, v)];
             for (slide, pick) in cases {
                 let ours = panel.illuminate(&vec![(Arc::new(slide), 1.0)]).at(position[0], position[1]);
-                for channel in 0..3 {
+                for (channel, ours) in ours.into_iter().take(3).enumerate() {
                     let light = |x, y| panel.light(pick(x, y)[channel]);
                     let expected = oracle(&panel, light, channel, [u, v]);
-                    prop_assert!((f64::from(ours[channel]) - expected).abs() < 1e-4, "{} {expected}", ours[channel]);
+                    prop_assert!((f64::from(ours) - expected).abs() < 1e-4, "{ours} {expected}");
                 }
             }
         }
@@ -429,14 +429,14 @@ mod tests {
         let mixture = vec![(columns.clone(), 0.5), (rows.clone(), 0.2), (uniform.clone(), 0.3)];
         let (u, v) = (panel.position(0, 7.31), panel.position(1, 11.8));
         let together = panel.illuminate(&mixture).at(u, v);
-        for channel in 0..3 {
+        for (channel, together) in together.into_iter().take(3).enumerate() {
             let sum: f32 = mixture
                 .iter()
                 .map(|(slide, weight)| {
                     *weight as f32 * panel.illuminate(&vec![(slide.clone(), 1.0)]).at(u, v)[channel]
                 })
                 .sum();
-            assert!((together[channel] - sum).abs() < 1e-6);
+            assert!((together - sum).abs() < 1e-6);
         }
     }
 

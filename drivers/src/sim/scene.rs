@@ -35,9 +35,6 @@ pub struct Material {
     /// Albedo of the depolarising part.
     #[serde(default)]
     pub diffuse: f64,
-    /// Share of the lobe that is smooth enough to light other objects like a mirror (one bounce).
-    #[serde(default)]
-    pub mirror: f64,
     /// Factor per projector channel on all of the above.
     #[serde(default = "untinted")]
     pub tint: [f64; 3],
@@ -255,7 +252,6 @@ impl Material {
         }
         faults.within(&format!("{key}.roughness"), self.roughness, 0.01, 1.0);
         faults.within(&format!("{key}.diffuse"), self.diffuse, 0.0, 1.0);
-        faults.within(&format!("{key}.mirror"), self.mirror, 0.0, 1.0);
         for (channel, &tint) in self.tint.iter().enumerate() {
             faults.at_least(&format!("{key}.tint[{channel}]"), tint, 0.0);
         }

@@ -372,9 +372,11 @@ mod tests {
     /// Truth of one pixel the slow way: march along the ray until a surface is crossed, and from there to the light.
     struct Oracle<'a> {
         description: &'a RigDescription,
-        /// Height above the surface of each object, positive on the camera's side.
-        surfaces: &'a [fn([f64; 3]) -> Option<f64>],
+        surfaces: &'a [Height],
     }
+
+    /// Height of a point above the surface of an object, positive on the camera's side; `None` beside it.
+    type Height = fn([f64; 3]) -> Option<f64>;
 
     impl Oracle<'_> {
         /// Which surface a straight line crosses first, and where (share of the way).
@@ -407,7 +409,7 @@ mod tests {
             let [cx, cy] = middle_px(camera.size);
             let far = 1500.0;
             let end = [(x - cx) / camera.focal_px * far, (y - cy) / camera.focal_px * far, far];
-            let (object, point) = self.crossing([0.0, 0.0, 500.0].map(|z| z / far * 0.0), end, 30_000)?;
+            let (object, point) = self.crossing([0.0; 3], end, 30_000)?;
             // Start a little above the surface.
             let light = [52.4, 0.0, 0.0];
             let start: [f64; 3] =
@@ -441,7 +443,7 @@ mod tests {
         let description = testing::small_rig();
         let panel = Panel::new(&description.projector);
         let world = World::new(&description, &scene, &panel).unwrap();
-        let surfaces: [fn([f64; 3]) -> Option<f64>; 3] = [
+        let surfaces: [Height; 3] = [
             |[x, y, z]| Some(0.1 * x + 0.02 * y - (z - 1050.0)),
             |[x, y, z]| {
                 ((-120.0..=-30.0).contains(&x) && (-80.0..=60.0).contains(&y))

@@ -5,10 +5,11 @@ use std::ops::Range;
 use polscan_patterns::Mode;
 
 use crate::decode::{
+    limits::Gates,
     plan::{BitFrames, Frames, PrefixCode},
     sample::Sample,
     types::Class,
-    words::{Gates, PixelMaps},
+    words::PixelMaps,
 };
 
 /// Invalid pixels that a surface may be interrupted by without ending.

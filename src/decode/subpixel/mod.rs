@@ -17,10 +17,11 @@ use self::{
 };
 use super::{
     gates::AxisShape,
+    limits::Gates,
     plan::Frames,
     sample::Sample,
     types::{AxisMap, Class, Thresholds},
-    words::{Gates, PixelMaps},
+    words::PixelMaps,
 };
 use crate::grid::Grid;
 

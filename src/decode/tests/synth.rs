@@ -78,12 +78,12 @@ pub fn uniform(key: u64) -> f64 {
 
 /// Standard normal (Box-Muller).
 pub fn normal(key: u64) -> f64 {
-    let (a, b) = (uniform(2 * key), uniform(2 * key + 1));
+    let (a, b) = (uniform(key.wrapping_mul(2)), uniform(key.wrapping_mul(2).wrapping_add(1)));
     (-2.0 * a.ln()).sqrt() * (2.0 * std::f64::consts::PI * b).cos()
 }
 
 /// Error function to 1.2e-7 (Chebyshev fit of erfc, as in the usual numerical handbooks).
-fn erf(x: f64) -> f64 {
+pub fn erf(x: f64) -> f64 {
     let t = 1.0 / (1.0 + 0.5 * x.abs());
     let poly = [
         -1.26551223,
@@ -216,25 +216,6 @@ impl Rig {
             .into_par_iter()
             .map(|(number, role)| (role, self.frame(scene, sequence, role, number as u64)))
             .collect()
-    }
-
-    pub fn cached_scan(&self, scene: &impl Scene, sequence: &Sequence) -> Vec<(Role, Vec<u16>)> {
-        let path = "/tmp/decode_bench.raw";
-        let n = self.width * self.height;
-        if let Ok(bytes) = std::fs::read(path) {
-            if bytes.len() == n * 2 * sequence.roles.len() {
-                return sequence
-                    .roles
-                    .iter()
-                    .zip(bytes.chunks(2 * n))
-                    .map(|(r, b)| (*r, b.chunks(2).map(|c| u16::from_le_bytes([c[0], c[1]])).collect()))
-                    .collect();
-            }
-        }
-        let scan = self.scan(scene, sequence);
-        let bytes: Vec<u8> = scan.iter().flat_map(|(_, f)| f.iter().flat_map(|s| s.to_le_bytes())).collect();
-        std::fs::write(path, bytes).unwrap();
-        scan
     }
 
     pub fn settings(&self, sequence: &Sequence) -> DecodeSettings {

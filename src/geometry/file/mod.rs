@@ -12,7 +12,7 @@ mod value;
 mod xml;
 mod yaml;
 
-use std::{fs, io::Read, path::Path};
+use std::path::Path;
 
 use thiserror::Error;
 
@@ -40,26 +40,14 @@ impl Default for ReadHints {
     }
 }
 
-/// Why a calibration file cannot be used.
-#[derive(Debug, Error)]
-pub enum CalibrationError {
-    /// The file cannot be read at all.
-    #[error("cannot read calibration {path}")]
-    Io {
-        /// File.
-        path: String,
-        /// Cause.
-        #[source]
-        source: std::io::Error,
-    },
-    /// Everything that is wrong with its content.
-    #[error("cannot use calibration {path}: {}", faults.join("; "))]
-    Faults {
-        /// File.
-        path: String,
-        /// Each fault.
-        faults: Vec<String>,
-    },
+/// Everything that is wrong with the content of a calibration file.
+#[derive(Debug, Clone, PartialEq, Eq, Error)]
+#[error("cannot use calibration {name}: {}", faults.join("; "))]
+pub struct CalibrationError {
+    /// File.
+    pub name: String,
+    /// Each fault.
+    pub faults: Vec<String>,
 }
 
 /// Formats, told apart by content first: names of calibration files are rarely right.
@@ -74,39 +62,18 @@ enum Format {
 
 impl Calibration {
     /// Reads a calibration file of any known format: `calibration.toml`, OpenCV FileStorage (YAML, XML), Bouguet's
-    /// `Calib_Results*.mat` or `.m`.
+    /// `Calib_Results*.mat` or `.m`. `name` is the file's name, for messages and as a last resort to tell the format;
+    /// `hints` fill in what the file leaves out.
     ///
     /// # Errors
-    /// As [`read_with`](Self::read_with).
-    pub fn read(path: &Path) -> Result<Self, CalibrationError> {
-        Self::read_with(path, &ReadHints::default())
-    }
-
-    /// Reads a calibration file that leaves things out, with `hints` filling them in.
-    ///
-    /// # Errors
-    /// [`CalibrationError::Io`] when the file cannot be read, [`CalibrationError::Faults`] with everything that is
-    /// missing or wrong in it.
-    pub fn read_with(path: &Path, hints: &ReadHints) -> Result<Self, CalibrationError> {
-        let name = path.display().to_string();
-        let io = |source| CalibrationError::Io { path: name.clone(), source };
-        let mut bytes = Vec::new();
-        fs::File::open(path).and_then(|file| file.take(MAX_BYTES + 1).read_to_end(&mut bytes)).map_err(io)?;
-        Self::from_bytes(&bytes, &name, hints)
-    }
-
-    /// As [`read_with`](Self::read_with), from memory; `name` is the file's name, for messages and as a last resort
-    /// to tell the format.
-    ///
-    /// # Errors
-    /// [`CalibrationError::Faults`].
+    /// Everything that is missing or wrong in it.
     pub fn from_bytes(bytes: &[u8], name: &str, hints: &ReadHints) -> Result<Self, CalibrationError> {
         parse(bytes, name, hints)
             .and_then(|calibration| {
                 let faults = calibration.faults();
                 if faults.is_empty() { Ok(calibration) } else { Err(faults) }
             })
-            .map_err(|faults| CalibrationError::Faults { path: name.to_owned(), faults })
+            .map_err(|faults| CalibrationError { name: name.to_owned(), faults })
     }
 }
 

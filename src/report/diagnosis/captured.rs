@@ -14,7 +14,8 @@ fn diagnosis(reason: &str) -> Diagnosis {
         | "camera-not-stopped"
         | "projector-failed"
         | "projector-not-black"
-        | "out-of-order" => Diagnosis::DeviceFault,
+        | "out-of-order"
+        | "missed-flip" => Diagnosis::DeviceFault,
         other => Diagnosis::from_slug(other).unwrap_or(Diagnosis::CaptureUnproven),
     }
 }

@@ -61,11 +61,13 @@ pub enum Diagnosis {
     CaptureUnproven,
     /// The capture was cancelled.
     Cancelled,
+    /// The frames are there and cannot be decoded.
+    DecodeFailed,
 }
 
 impl Diagnosis {
     /// All of them, in the order of the documentation.
-    pub const ALL: [Self; 20] = [
+    pub const ALL: [Self; 21] = [
         Self::StaleFrame,
         Self::LostFrame,
         Self::TornFrame,
@@ -86,6 +88,7 @@ impl Diagnosis {
         Self::DeviceFault,
         Self::CaptureUnproven,
         Self::Cancelled,
+        Self::DecodeFailed,
     ];
 
     /// Its name in files.
@@ -111,6 +114,7 @@ impl Diagnosis {
             Self::DeviceFault => "device-fault",
             Self::CaptureUnproven => "capture-unproven",
             Self::Cancelled => "cancelled",
+            Self::DecodeFailed => "decode-failed",
         }
     }
 

@@ -585,7 +585,8 @@ mod tests {
         assert_eq!(displaced(20), []);
         let crossings = |illegal: u64| {
             report(move |decoded| {
-                decoded.boundaries = vec![BoundaryCheck { axis: Axis::Row, bit: 3, legal: 900, illegal }];
+                decoded.boundaries =
+                    vec![BoundaryCheck { axis: Axis::Row, bit: 3, legal: 900, illegal, against: 0 }];
             })
         };
         assert_eq!(kinds(&crossings(30)), []);

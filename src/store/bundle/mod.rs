@@ -67,6 +67,8 @@ struct Progress {
     files: BTreeMap<String, FileEntry>,
     unsynced: Vec<(PathBuf, Box<dyn DiskFile>)>,
     folders: BTreeSet<PathBuf>,
+    /// Number of frames in `frames.npy`, once it is committed.
+    frames: Option<usize>,
     hashing: Duration,
 }
 
@@ -143,7 +145,7 @@ impl BundleWriter {
         self.write_with(name, |out| io::Write::write_all(out, bytes))
     }
 
-    /// Begins `frames.npy`, to which frames are then added one by one.
+    /// Begins `frames.npy`, to which frames are then added one by one; there may be none.
     pub fn frames(
         &self,
         frames: usize,
@@ -154,7 +156,7 @@ impl BundleWriter {
         let path = file.path().to_owned();
         let stream = FrameStream::new(file, frames, height, width, bit_depth)
             .map_err(|error| StorageError::file("write", &path, error))?;
-        Ok(FramesWriter { stream, path })
+        Ok(FramesWriter { stream, path, writer: self, frames })
     }
 
     /// Writes `arrays` as the archive `name`.
@@ -192,9 +194,9 @@ impl BundleWriter {
     pub fn finish(mut self, mut manifest: Manifest) -> Result<(Manifest, WriteTimings), StorageError> {
         let start = Instant::now();
         let progress = self.progress.get_mut().unwrap_or_else(PoisonError::into_inner);
-        let Progress { files, mut unsynced, folders, hashing, .. } = std::mem::take(progress);
+        let Progress { files, mut unsynced, folders, frames, hashing, .. } = std::mem::take(progress);
         manifest.files = files;
-        check(&manifest)?;
+        check(&manifest, frames)?;
         unsynced.par_iter_mut().try_for_each(|(path, file)| {
             file.sync().map_err(|error| StorageError::file("sync", path, error))
         })?;
@@ -227,10 +229,11 @@ impl Drop for BundleWriter {
     }
 }
 
-/// Whether a bundle with `manifest` can be read again.
-fn check(manifest: &Manifest) -> Result<(), StorageError> {
+/// Whether a bundle with `manifest`, in whose own `frames.npy` are `frames`, is what its manifest says. It need not be
+/// decodable: a capture that was cut short, even before its first frame, is kept as well.
+fn check(manifest: &Manifest, frames: Option<usize>) -> Result<(), StorageError> {
     let refused = |detail: String| Err(StorageError::refused(manifest::FILE_NAME, detail));
-    if let Err(faults) = manifest.check(Policy::Local, None) {
+    if let Err(faults) = manifest.check_form(Policy::Local) {
         return refused(faults.to_string());
     }
     let mut named: Vec<&String> = manifest.calibration.iter().collect();
@@ -238,6 +241,13 @@ fn check(manifest: &Manifest) -> Result<(), StorageError> {
         FrameFiles::Images(paths) if manifest.source.is_none() => named.extend(paths),
         FrameFiles::Npy(path) if manifest.source.is_none() => named.push(path),
         _ => {}
+    }
+    let own = matches!(&manifest.frames, FrameFiles::Npy(path) if path == FRAMES_FILE_NAME);
+    if let Some(frames) = frames.filter(|&frames| own && frames != manifest.sequence.len()) {
+        let entries = manifest.sequence.len();
+        return refused(format!(
+            "has {entries} entries in `sequence` for {frames} frames in {FRAMES_FILE_NAME}"
+        ));
     }
     if manifest.truth_objects.is_some() != manifest.files.contains_key(maps::TRUTH_FILE_NAME) {
         return refused(format!("{} and the names of its objects belong together", maps::TRUTH_FILE_NAME));
@@ -253,6 +263,8 @@ fn check(manifest: &Manifest) -> Result<(), StorageError> {
 pub struct FramesWriter<'a> {
     stream: FrameStream<BundleFile<'a>>,
     path: PathBuf,
+    writer: &'a BundleWriter,
+    frames: usize,
 }
 
 impl FramesWriter<'_> {
@@ -264,7 +276,9 @@ impl FramesWriter<'_> {
     /// Ends the file; all frames must have been added.
     pub fn finish(self) -> Result<(), StorageError> {
         let file = self.stream.finish().map_err(|error| StorageError::file("write", &self.path, error))?;
-        file.commit()
+        file.commit()?;
+        self.writer.progress().frames = Some(self.frames);
+        Ok(())
     }
 }
 

@@ -4,6 +4,7 @@ use std::{
     ffi::{OsStr, OsString},
     fs::{self, File, TryLockError},
     io,
+    os::unix::fs::MetadataExt,
     path::{Path, PathBuf},
 };
 
@@ -88,8 +89,6 @@ impl Place {
 
     /// Gives the finished folder its name, on the medium.
     pub(super) fn publish(&mut self, disk: &dyn Disk) -> Result<(), StorageError> {
-        let marker = self.partial.join(MARKER);
-        fs::remove_file(&marker).map_err(|error| StorageError::file("remove", &marker, error))?;
         let sync = |folder: &Path| {
             disk.sync_folder(folder).map_err(|error| StorageError::file("sync folder", folder, error))
         };
@@ -102,6 +101,10 @@ impl Place {
         }
         disk.rename(&self.partial, &self.target)
             .map_err(|error| StorageError::file("give the finished bundle its name", &self.target, error))?;
+        // Only now: without its marker an unfinished folder is nobody's, and beside a name that is not final somebody
+        // else would take it for his own. What a crash here leaves of the marker changes nothing in the bundle.
+        let unmarked = unmark(&self.target).and_then(|()| sync(&self.target));
+        unmarked.inspect_err(|_| take_back(std::slice::from_ref(&self.target)))?;
         // A name that may not survive a power cut is taken back, as the caller will report a failure.
         sync(&parent).inspect_err(|_| take_back(std::slice::from_ref(&self.target)))?;
         // Parents that were made are entries of folders as well.
@@ -116,8 +119,10 @@ impl Place {
     fn move_entries(&self, disk: &dyn Disk, moved: &mut Vec<PathBuf>) -> Result<(), StorageError> {
         let entries =
             list(&self.partial).map_err(|error| StorageError::file("list", &self.partial, error))?;
-        let (manifest, others): (Vec<_>, Vec<_>) =
-            entries.into_iter().partition(|name| name.as_os_str() == OsStr::new(manifest::FILE_NAME));
+        let (manifest, others): (Vec<_>, Vec<_>) = entries
+            .into_iter()
+            .filter(|name| name.as_os_str() != OsStr::new(MARKER))
+            .partition(|name| name.as_os_str() == OsStr::new(manifest::FILE_NAME));
         for name in others.iter().chain(&manifest) {
             let to = self.target.join(name);
             let fail = |error| StorageError::file("give the finished file its name", &to, error);
@@ -127,6 +132,7 @@ impl Place {
             disk.rename(&self.partial.join(name), &to).map_err(fail)?;
             moved.push(to);
         }
+        unmark(&self.partial)?;
         fs::remove_dir(&self.partial).map_err(|error| StorageError::file("remove", &self.partial, error))
     }
 
@@ -135,6 +141,12 @@ impl Place {
         remove_folder(&self.partial);
         remove_made(&self.made);
     }
+}
+
+/// Removes the marker from `folder`.
+fn unmark(folder: &Path) -> Result<(), StorageError> {
+    let marker = folder.join(MARKER);
+    fs::remove_file(&marker).map_err(|error| StorageError::file("remove", &marker, error))
 }
 
 /// Removes what already bears its final name, the last first: the manifest moved last, and without it what is left is
@@ -279,7 +291,7 @@ impl Target {
             Err(error) if error.kind() == io::ErrorKind::AlreadyExists => match state(partial) {
                 State::Live => return Err(StorageError::Busy { path: self.path.clone() }),
                 State::Foreign => return Ok(None),
-                State::Stale => {
+                State::Stale(_lock) => {
                     remove_folder(partial);
                     disk.create_folder(partial)
                 }
@@ -288,17 +300,19 @@ impl Target {
         };
         made.map_err(|error| StorageError::file("create folder", partial, error))?;
         let marker = partial.join(MARKER);
-        let locked = File::create_new(&marker).and_then(|file| match file.try_lock() {
-            Ok(()) => Ok(file),
-            Err(TryLockError::WouldBlock) => Err(io::ErrorKind::WouldBlock.into()),
-            // Some network file systems have no locks; then nothing tells a live writer from a dead one but its age.
-            Err(TryLockError::Error(error)) if error.kind() == io::ErrorKind::Unsupported => Ok(file),
-            Err(TryLockError::Error(error)) => Err(error),
-        });
-        locked.map(Some).map_err(|error| {
+        let fail = |error| {
             remove_folder(partial);
             StorageError::file("create", &marker, error)
-        })
+        };
+        let file = File::create_new(&marker).map_err(fail)?;
+        match file.try_lock() {
+            Ok(()) => Ok(Some(file)),
+            // Somebody looked at the marker before it was locked and takes the folder for his own.
+            Err(TryLockError::WouldBlock) => Err(StorageError::Busy { path: self.path.clone() }),
+            // Some network file systems have no locks; there what a dead process left is never taken for stale.
+            Err(TryLockError::Error(error)) if error.kind() == io::ErrorKind::Unsupported => Ok(Some(file)),
+            Err(TryLockError::Error(error)) => Err(fail(error)),
+        }
     }
 }
 
@@ -335,45 +349,64 @@ fn refuse_occupied(path: &Path) -> Result<(), StorageError> {
 }
 
 /// Whose an unfinished folder is.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug)]
 enum State {
-    /// A living process writes it.
+    /// A living process writes it, or nothing tells that none does.
     Live,
-    /// A process died over it.
-    Stale,
+    /// A process died over it. Nobody else finds it stale as long as its marker is held, which is locked.
+    Stale(File),
     /// Nothing says that it is ours.
     Foreign,
 }
 
 fn state(partial: &Path) -> State {
-    if let Ok(marker) = File::open(partial.join(MARKER)) {
-        return match marker.try_lock() {
-            Err(TryLockError::WouldBlock) => State::Live,
-            _ => State::Stale,
-        };
+    let path = partial.join(MARKER);
+    let marker = match File::open(&path) {
+        Ok(marker) => marker,
+        Err(error) if matches!(error.kind(), io::ErrorKind::NotFound | io::ErrorKind::NotADirectory) => {
+            return State::Foreign;
+        }
+        Err(_) => return State::Live,
+    };
+    // Between opening and locking, the folder may have got its name or another owner.
+    match marker.try_lock() {
+        Ok(()) if is_same(&marker, &path) => State::Stale(marker),
+        _ => State::Live,
     }
-    // Between losing its marker and getting its name a bundle is complete.
-    let manifest = fs::read(partial.join(manifest::FILE_NAME)).unwrap_or_default();
-    if manifest::Manifest::parse(&manifest).is_ok() { State::Stale } else { State::Foreign }
+}
+
+/// Whether `path` still names the opened `file`.
+fn is_same(file: &File, path: &Path) -> bool {
+    let identity = |found: fs::Metadata| (found.dev(), found.ino());
+    match (file.metadata(), fs::symlink_metadata(path)) {
+        (Ok(opened), Ok(named)) => identity(opened) == identity(named),
+        _ => false,
+    }
+}
+
+/// Stale folders in `folder` in order of their names, with their locks.
+fn find_stale(folder: &Path) -> io::Result<Vec<(PathBuf, File)>> {
+    let mut found: Vec<(PathBuf, File)> = list(folder)?
+        .into_iter()
+        .filter(|name| Path::new(name).extension().is_some_and(|extension| extension == "partial"))
+        .map(|name| folder.join(name))
+        .filter(|path| path.is_dir())
+        .filter_map(|path| match state(&path) {
+            State::Stale(lock) => Some((path, lock)),
+            State::Live | State::Foreign => None,
+        })
+        .collect();
+    found.sort_by(|(one, _), (other, _)| one.cmp(other));
+    Ok(found)
 }
 
 /// Folders in `folder` that unfinished bundles of dead processes left behind.
 pub fn stale_partials(folder: &Path) -> io::Result<Vec<PathBuf>> {
-    let mut found: Vec<PathBuf> = list(folder)?
-        .into_iter()
-        .filter(|name| Path::new(name).extension().is_some_and(|extension| extension == "partial"))
-        .map(|name| folder.join(name))
-        .filter(|path| path.is_dir() && state(path) == State::Stale)
-        .collect();
-    found.sort();
-    Ok(found)
+    Ok(find_stale(folder)?.into_iter().map(|(path, _)| path).collect())
 }
 
 /// Removes what [`stale_partials`] finds, and returns it.
 pub fn remove_stale_partials(folder: &Path) -> io::Result<Vec<PathBuf>> {
-    let found = stale_partials(folder)?;
-    for path in &found {
-        fs::remove_dir_all(path)?;
-    }
-    Ok(found)
+    let remove = |(path, _lock): (PathBuf, File)| fs::remove_dir_all(&path).map(|()| path);
+    find_stale(folder)?.into_iter().map(remove).collect()
 }

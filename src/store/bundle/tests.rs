@@ -77,7 +77,7 @@ fn assert_whole(out: &Path) {
     for (index, plane) in frames.planes.iter().enumerate() {
         assert!(matches!(plane.plane(), Plane::U16(samples) if samples == frame(index)));
     }
-    let read = bundle.truth().unwrap().unwrap();
+    let read = bundle.truth(SIZE).unwrap().unwrap();
     assert_eq!((read.column.data(), read.objects), (truth().column.data(), truth().objects));
 }
 
@@ -208,14 +208,126 @@ fn what_a_dead_process_left_is_recognised_and_replaced() {
 #[test]
 fn a_process_that_dies_before_the_last_rename_leaves_a_stale_folder() {
     let folder = TempDir::new().unwrap();
+    let (out, partial) = (folder.path().join("scan"), folder.path().join("scan.partial"));
+    let write = || {
+        let writer = BundleWriter::create(&out, None, 0).unwrap();
+        fill(&writer).unwrap();
+        writer.finish(manifest()).unwrap();
+    };
+    write();
+    fs::rename(&out, &partial).unwrap();
+    fs::write(partial.join(".polscan-partial"), "").unwrap();
+    assert_eq!(remove_stale_partials(folder.path()).unwrap(), [partial.clone()]);
+    assert!(names(folder.path()).is_empty());
+    // A bundle that somebody named so has no marker, and is never removed.
+    write();
+    fs::rename(&out, &partial).unwrap();
+    assert!(remove_stale_partials(folder.path()).unwrap().is_empty());
+    write();
+    assert_whole(&partial);
+    assert_whole(&out);
+}
+
+#[test]
+fn a_process_that_dies_after_the_last_rename_leaves_a_finished_bundle() {
+    let folder = TempDir::new().unwrap();
     let out = folder.path().join("scan");
     let writer = BundleWriter::create(&out, None, 0).unwrap();
     fill(&writer).unwrap();
     writer.finish(manifest()).unwrap();
-    // Complete, unmarked, not yet renamed.
-    fs::rename(&out, folder.path().join("scan.partial")).unwrap();
-    assert_eq!(remove_stale_partials(folder.path()).unwrap().len(), 1);
-    assert!(names(folder.path()).is_empty());
+    fs::write(out.join(".polscan-partial"), "").unwrap();
+    assert!(remove_stale_partials(folder.path()).unwrap().is_empty());
+    assert!(matches!(BundleWriter::create(&out, None, 0), Err(StorageError::Occupied { .. })));
+    let bundle = Bundle::open(&out, Policy::Upload, None).unwrap();
+    bundle.verify().unwrap();
+    assert!(!bundle.manifest().files.contains_key(".polscan-partial"));
+}
+
+/// A disk that looks, right before and after each rename, for folders that a second process would take for stale.
+struct Watched(Arc<AtomicUsize>);
+
+impl Disk for Watched {
+    fn create(&self, path: &Path) -> io::Result<Box<dyn DiskFile>> {
+        RealDisk.create(path)
+    }
+
+    fn create_folder(&self, path: &Path) -> io::Result<()> {
+        RealDisk.create_folder(path)
+    }
+
+    fn rename(&self, from: &Path, to: &Path) -> io::Result<()> {
+        let folder = to.parent().unwrap();
+        assert!(stale_partials(folder).unwrap().is_empty());
+        assert!(matches!(BundleWriter::create(to, None, 0), Err(StorageError::Busy { .. })));
+        self.0.fetch_add(1, Ordering::SeqCst);
+        RealDisk.rename(from, to)?;
+        assert!(stale_partials(folder).unwrap().is_empty());
+        Ok(())
+    }
+
+    fn sync_folder(&self, path: &Path) -> io::Result<()> {
+        RealDisk.sync_folder(path)
+    }
+
+    fn free_bytes(&self, path: &Path) -> io::Result<Option<u64>> {
+        RealDisk.free_bytes(path)
+    }
+}
+
+#[test]
+fn a_finished_folder_is_never_stale_before_it_has_its_name() {
+    let folder = TempDir::new().unwrap();
+    let out = folder.path().join("scan");
+    let renames = Arc::new(AtomicUsize::new(0));
+    let writer = BundleWriter::create_on(Arc::new(Watched(Arc::clone(&renames))), &out, None, 0).unwrap();
+    fill(&writer).unwrap();
+    writer.finish(manifest()).unwrap();
+    assert_eq!(renames.load(Ordering::SeqCst), 1);
+    assert_whole(&out);
+}
+
+#[test]
+fn a_truth_that_does_not_fit_the_frames_is_refused() {
+    let folder = TempDir::new().unwrap();
+    let out = folder.path().join("scan");
+    let writer = BundleWriter::create(&out, None, 0).unwrap();
+    fill(&writer).unwrap();
+    writer.finish(manifest()).unwrap();
+    let bundle = Bundle::open(&out, Policy::Local, None).unwrap();
+    let with = |truth: &Truth, size| {
+        let file = File::create(out.join(maps::TRUTH_FILE_NAME)).unwrap();
+        maps::write_truth(file, truth).unwrap();
+        bundle.truth(size).map(drop).map_err(|error| error.to_string())
+    };
+    let error = with(&truth(), (4, 4)).unwrap_err();
+    assert!(error.contains("`column` is 4 x 3, the frames are 4 x 4"), "{error}");
+    let error = with(&Truth { row: Grid::filled(3, 3, 0.0), ..truth() }, SIZE).unwrap_err();
+    assert!(error.contains("`row` is 3 x 3"), "{error}");
+    let error = with(&Truth { object: Grid::filled(4, 3, 1), ..truth() }, SIZE).unwrap_err();
+    assert!(error.contains("`object` holds 1"), "{error}");
+    with(&Truth { object: Grid::filled(4, 3, 255), ..truth() }, SIZE).unwrap();
+}
+
+#[test]
+fn a_capture_that_was_cut_short_is_kept_and_cannot_be_decoded() {
+    for count in [0, 1, 2] {
+        let folder = TempDir::new().unwrap();
+        let out = folder.path().join("scan");
+        let writer = BundleWriter::create(&out, None, 0).unwrap();
+        let mut frames = writer.frames(count, SIZE, 12).unwrap();
+        (0..count).for_each(|index| frames.push(Plane::U16(&frame(index))).unwrap());
+        frames.finish().unwrap();
+        let mut short = Manifest { truth_objects: None, ..manifest() };
+        short.sequence.truncate(count);
+        assert!(!short.sequence.iter().any(|role| matches!(role, polscan_patterns::Role::Code { .. })));
+        let (written, _) = writer.finish(short).unwrap();
+        let bytes = fs::read(out.join(manifest::FILE_NAME)).unwrap();
+        assert_eq!(Manifest::parse(&bytes).unwrap().manifest, written);
+        let error = Bundle::open(&out, Policy::Local, None).unwrap_err().to_string();
+        assert!(error.contains("no code frames") && error.contains("nothing can be decoded"), "{error}");
+        let entry = &written.files[FRAMES_FILE_NAME];
+        assert_eq!(fs::metadata(out.join(FRAMES_FILE_NAME)).unwrap().len(), entry.bytes);
+    }
 }
 
 #[test]
@@ -231,8 +343,9 @@ fn names_that_are_none_are_refused() {
 
 #[test]
 fn a_manifest_that_could_not_be_read_back_is_not_written() {
-    let changes: [fn(&mut Manifest); 4] = [
+    let changes: [fn(&mut Manifest); 5] = [
         |manifest| manifest.sequence.clear(),
+        |manifest| manifest.sequence.truncate(3),
         |manifest| manifest.calibration = Some("calibration.toml".to_owned()),
         |manifest| manifest.frames = FrameFiles::Npy("other.npy".to_owned()),
         |manifest| manifest.truth_objects = None,

@@ -238,6 +238,21 @@ fn mixed_frames_are_refused_by_name() {
 }
 
 #[test]
+fn levels_beyond_the_samples_are_refused_without_a_bit_depth_too() {
+    let load = |bytes: Vec<u8>, saturation, black_level| {
+        let camera = Camera { saturation, black_level, ..Camera::default() };
+        load_files(&[("a.png", bytes)], Some(camera)).map(drop).map_err(|error| error.to_string())
+    };
+    let eight = || encode(gray8(0), ImageFormat::Png);
+    let error = load(eight(), Some(4095), Some(256.0)).unwrap_err();
+    for part in ["`camera.saturation`: is 4095 DN", "`camera.black_level`: is 256 DN", "end at 255"] {
+        assert!(error.contains(part), "{error}");
+    }
+    load(eight(), Some(255), Some(200.0)).unwrap();
+    load(encode(gray16(0), ImageFormat::Png), Some(4095), Some(256.0)).unwrap();
+}
+
+#[test]
 fn camera_and_frames_must_agree() {
     let png = || encode(gray16(0), ImageFormat::Png);
     let camera = |change: fn(&mut Camera)| {

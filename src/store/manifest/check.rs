@@ -15,8 +15,22 @@ use crate::store::{
 const MAX_BITS: u8 = 16;
 
 impl Manifest {
-    /// Every contradiction of the manifest with itself, its schema or `policy`. `mode` comes before the manifest's own.
+    /// Every contradiction of the manifest with itself, its schema or `policy`, and whatever keeps its frames from
+    /// being decoded. `mode` comes before the manifest's own.
     pub fn check(&self, policy: Policy, mode: Option<Mode>) -> Result<(), Faults> {
+        let mut faults = self.form_faults(policy, mode);
+        self.check_decodable(&mut faults);
+        if faults.is_empty() { Ok(()) } else { Err(Faults(faults)) }
+    }
+
+    /// As [`Manifest::check`], but frames that nothing can be decoded from pass, as those of a capture that was cut
+    /// short.
+    pub fn check_form(&self, policy: Policy) -> Result<(), Faults> {
+        let faults = self.form_faults(policy, None);
+        if faults.is_empty() { Ok(()) } else { Err(Faults(faults)) }
+    }
+
+    fn form_faults(&self, policy: Policy, mode: Option<Mode>) -> Vec<Fault> {
         let mut faults = Vec::new();
         self.check_codes(&mut faults);
         self.check_sequence(&mut faults);
@@ -26,7 +40,7 @@ impl Manifest {
         self.check_frames(policy, &mut faults);
         self.check_camera(&mut faults);
         self.check_own(&mut faults);
-        if faults.is_empty() { Ok(()) } else { Err(Faults(faults)) }
+        faults
     }
 
     /// Code of `axis` for a side of `size` pixels.
@@ -74,8 +88,14 @@ impl Manifest {
                 first_seen.insert(role, first);
             }
         }
-        if first_seen.is_empty() {
-            faults.push(Fault::new("sequence", "has no frame with role \"code\": nothing can be decoded"));
+    }
+
+    fn check_decodable(&self, faults: &mut Vec<Fault>) {
+        if !self.sequence.iter().any(|role| matches!(role, Role::Code { .. })) {
+            faults.push(Fault::new(
+                "sequence",
+                "has no code frames (role \"code\"): nothing can be decoded; capture the scene again",
+            ));
         }
         for axis in [Axis::Column, Axis::Row] {
             faults.extend(self.missing_bits(axis));
@@ -220,17 +240,10 @@ impl Manifest {
                 let message = format!("is {} px, expected a positive number", processing.row_gate_px);
                 faults.push(Fault::new("processing.row_gate_px", message));
             }
-            let gates = processing.thresholds;
-            for (key, gate) in [
-                ("lit_sigma", gates.lit_sigma),
-                ("soft_bit_sigma", gates.soft_bit_sigma),
-                ("snap_px", gates.snap_px),
-            ] {
-                if !(gate.is_finite() && gate >= 0.0) {
-                    let message = format!("is {gate}, expected a number that is not negative");
-                    faults.push(Fault::new(format!("processing.thresholds.{key}"), message));
-                }
-            }
+            let gates = processing.thresholds.faults().into_iter();
+            faults.extend(
+                gates.map(|(key, message)| Fault::new(format!("processing.thresholds.{key}"), message)),
+            );
         }
         for (name, entry) in &self.files {
             if entry.sha256.len() != 64 || !entry.sha256.bytes().all(|digit| digit.is_ascii_hexdigit()) {

@@ -19,8 +19,8 @@ use serde::{Deserialize, Serialize};
 use crate::{
     cloud::DEFAULT_ROW_GATE_PX,
     decode::{DecodeSettings, Thresholds},
-    report::NamedRegion,
-    sequencer::{CaptureRecord, Retake},
+    report::{NamedRegion, Reason},
+    sequencer::{CaptureNotes, CaptureRecord, Retake},
     truth::TruthObject,
 };
 
@@ -249,6 +249,12 @@ pub struct Capture {
     pub frames: Vec<FrameEvidence>,
     /// Pairs that were captured again.
     pub retaken: Vec<Retake>,
+    /// What was noticed.
+    #[serde(default)]
+    pub notes: CaptureNotes,
+    /// Why the capture ended before its end; absent for a complete one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub failure: Option<Reason>,
 }
 
 /// What proves that a frame shows its role.
@@ -257,6 +263,7 @@ pub struct FrameEvidence {
     /// Receipt of the slide.
     pub receipt: PresentReceipt,
     /// When its exposure was asked for, on the rig's clock.
+    #[serde(rename = "triggered_ns")]
     pub triggered: Timestamp,
     /// Identity of the exposure.
     pub stamp: FrameStamp,
@@ -370,6 +377,8 @@ impl Manifest {
                 })
                 .collect(),
             retaken: record.retaken.clone(),
+            notes: record.notes.clone(),
+            failure: None,
         });
     }
 

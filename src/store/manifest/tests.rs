@@ -132,10 +132,10 @@ fn every_fault_is_found_and_named() {
         ("/projector/width", json!(9000), "outside 1..=8192"),
         ("/projector/width", json!(-1), "`projector.width`"),
         ("/code_bits/column", json!(9), "`code_bits.column`: 9 code bits and offset 0 cannot number 1024"),
-        ("/code_bits/column", json!(17), "17 code bits"),
+        ("/code_bits/column", json!(17), "17 bits"),
         ("/code_offset/column", json!(1), "10 code bits and offset 1 cannot number 1024"),
         ("/code_offset/row", json!(4_294_967_295u32), "cannot number 768"),
-        ("/sequence", json!([]), "no frame with role \"code\""),
+        ("/sequence", json!([]), "no code frames (role \"code\")"),
         ("/sequence", json!("all"), "must be a list"),
         ("/sequence/0", json!({"role": "wite"}), "`sequence[0]`: unknown variant `wite`"),
         ("/sequence/0", json!({"role": "white", "inverse": true}), "unknown key `inverse`"),
@@ -186,6 +186,37 @@ fn every_fault_is_found_and_named() {
     for (pointer, value, expected) in cases {
         let found = faults_with(pointer, value.clone());
         assert!(found.iter().any(|fault| fault.contains(expected)), "{pointer} = {value}: {found:?}");
+    }
+}
+
+#[test]
+fn every_gate_has_its_range() {
+    let mut manifest = read(&example(), Upload).unwrap();
+    let mut found = |thresholds| {
+        manifest.processing = Some(Processing { thresholds, ..Processing::default() });
+        match manifest.check(Upload, None) {
+            Ok(()) => Vec::new(),
+            Err(faults) => faults.0.into_iter().map(|fault| fault.key).collect(),
+        }
+    };
+    let gates = |lit_sigma, soft_bit_sigma, snap_px, fit_edges| Thresholds {
+        lit_sigma,
+        soft_bit_sigma,
+        snap_px,
+        fit_edges,
+    };
+    for allowed in [Thresholds::default(), gates(1.0, 0.1, 0.5, 2), gates(100.0, 100.0, 16.0, 64)] {
+        assert!(found(allowed).is_empty(), "{allowed:?}");
+    }
+    let all = ["lit_sigma", "soft_bit_sigma", "snap_px", "fit_edges"]
+        .map(|key| format!("processing.thresholds.{key}"));
+    for refused in [
+        gates(0.99, 0.09, 0.49, 1),
+        gates(100.1, 100.1, 16.1, 65),
+        gates(f64::NAN, f64::NAN, f64::NAN, 0),
+        gates(f64::INFINITY, f64::INFINITY, f64::NEG_INFINITY, usize::MAX),
+    ] {
+        assert_eq!(found(refused), all, "{refused:?}");
     }
 }
 
@@ -302,6 +333,8 @@ fn a_full_manifest_of_our_own_survives() {
             evidence: "residual 9.1 sigma".to_owned(),
             attempt: 1,
         }],
+        notes: CaptureNotes::default(),
+        failure: None,
     });
     manifest.truth_objects = Some(vec![TruthObject { name: "white".to_owned(), planar: true }]);
     manifest.processing = Some(Processing {
@@ -326,7 +359,7 @@ proptest! {
     #[test]
     fn decode_settings_survive_exactly(
         width in 1u32..2000, height in 1u32..2000, black in 0.0f64..200.0, gain in 1e-3f64..10.0,
-        read_noise in 0.0f64..20.0, lit in 0.0f64..10.0, soft in 0.0f64..10.0, depth in 9u8..17, noisy: bool,
+        read_noise in 0.0f64..20.0, lit in 1.0f64..10.0, soft in 0.1f64..10.0, depth in 9u8..17, noisy: bool,
     ) {
         let sequence = Sequence::new(Mode::Pse, ProjectorSize { width, height }).unwrap();
         let mut manifest = Manifest::new(&sequence, FrameFiles::Npy("frames.npy".to_owned()));

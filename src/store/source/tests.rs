@@ -26,7 +26,7 @@ fn a_bundle_opens_by_its_folder_and_by_its_manifest() {
         assert_eq!((frames.width, frames.height, frames.planes.len()), (1, 1, 2));
         assert_eq!(bundle.calibration().unwrap().unwrap().1, b"text");
         assert_eq!(bundle.notes(), ["the manifest's key `note` is unknown and was ignored"]);
-        assert!(bundle.truth().unwrap().is_none());
+        assert!(bundle.truth((1, 1)).unwrap().is_none());
         let origin = bundle.origin(&frames).unwrap();
         assert_eq!(origin.frames[1].path, "sub/b.pgm");
         assert_eq!(origin.frames[1].entry.bytes, 12);

@@ -1,0 +1,7 @@
+//! The program from outside: commands in, folders and exit codes out, on a small copy of the paper's rig.
+
+mod captures_of_the_twin;
+mod faults;
+mod patterns;
+mod refusals;
+mod rig;

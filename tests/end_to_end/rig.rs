@@ -1,0 +1,176 @@
+//! A quarter-size copy of `config/sim.toml` in a folder of its own, and the program run on it.
+
+use std::{
+    fs,
+    path::{Path, PathBuf},
+    process::{Command, Output},
+};
+
+use serde_json::Value;
+use toml::Table;
+
+/// Sizes and focal lengths are divided by this; three camera pixels still see one projector pixel.
+const SCALE: f64 = 4.0;
+
+/// A configuration that a test may change before it runs the program.
+pub struct Rig {
+    folder: tempfile::TempDir,
+    config: Table,
+}
+
+impl Rig {
+    /// The paper's rig, a quarter of its size.
+    pub fn small() -> Self {
+        let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("config");
+        let folder = tempfile::tempdir().expect("a folder for the rig");
+        let mut config = table(&root.join("sim.toml"));
+        let mut calibration = table(&root.join("sim-calibration.toml"));
+        for device in ["camera", "projector"] {
+            shrink_description(at(&mut config, &["sim", device]));
+            shrink_lens(at(&mut calibration, &[device]));
+        }
+        let text = toml::to_string(&calibration).expect("a table is TOML");
+        fs::write(folder.path().join("sim-calibration.toml"), text).expect("the calibration is written");
+        fs::create_dir(folder.path().join("scenes")).expect("a folder for scenes");
+        for scene in fs::read_dir(root.join("scenes")).expect("the scenes") {
+            let path = scene.expect("a scene").path();
+            let name = path.file_name().expect("a scene has a name");
+            fs::copy(&path, folder.path().join("scenes").join(name)).expect("the scene is copied");
+        }
+        Self { folder, config }
+    }
+
+    /// Sets a key such as `sim.camera.bits`.
+    pub fn set(mut self, key: &str, value: impl Into<toml::Value>) -> Self {
+        let (path, name) = key.rsplit_once('.').expect("a key has a table");
+        let path: Vec<&str> = path.split('.').collect();
+        at(&mut self.config, &path).insert(name.into(), value.into());
+        self
+    }
+
+    /// A path in the rig's folder.
+    pub fn path(&self, name: &str) -> PathBuf {
+        self.folder.path().join(name)
+    }
+
+    /// Runs `polscan scan` into the folder `out`.
+    pub fn scan(&self, out: &str, arguments: &[&str]) -> Run {
+        let config = self.path("rig.toml");
+        fs::write(&config, toml::to_string(&self.config).expect("a table is TOML"))
+            .expect("the configuration");
+        let mut all = vec!["scan", "--config", text(&config), "--out"];
+        let out = self.path(out);
+        all.push(text(&out));
+        all.extend(arguments);
+        polscan(&all)
+    }
+
+    /// Runs `polscan decode` on the bundle in `bundle` into the folder `out`.
+    pub fn decode(&self, bundle: &str, out: &str, arguments: &[&str]) -> Run {
+        let (bundle, out) = (self.path(bundle), self.path(out));
+        polscan(&[&["decode", text(&bundle), "--out", text(&out)], arguments].concat())
+    }
+
+    /// report.json of the result in `out`.
+    pub fn report(&self, out: &str) -> Value {
+        json(&self.path(out).join("report.json"))
+    }
+
+    /// Bytes of a file of the result in `out`.
+    pub fn bytes(&self, out: &str, name: &str) -> Vec<u8> {
+        fs::read(self.path(out).join(name)).unwrap_or_else(|error| panic!("{out}/{name}: {error}"))
+    }
+}
+
+/// What a run of the program came to.
+pub struct Run {
+    /// Exit code.
+    pub code: i32,
+    /// What it printed.
+    pub stdout: String,
+    /// What it complained of.
+    pub stderr: String,
+}
+
+impl Run {
+    /// Panics with everything that was printed unless the program ended with `code`.
+    pub fn expect(self, code: i32) -> Self {
+        assert_eq!(self.code, code, "stdout:\n{}\nstderr:\n{}", self.stdout, self.stderr);
+        assert!(!self.stderr.contains("panicked"), "{}", self.stderr);
+        self
+    }
+}
+
+/// Runs the program.
+pub fn polscan(arguments: &[&str]) -> Run {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_polscan"));
+    run(command.args(arguments))
+}
+
+/// Runs a prepared command.
+pub fn run(command: &mut Command) -> Run {
+    let Output { status, stdout, stderr } = command.output().expect("polscan starts");
+    let text = |bytes: Vec<u8>| String::from_utf8(bytes).expect("output is text");
+    Run { code: status.code().unwrap_or(-1), stdout: text(stdout), stderr: text(stderr) }
+}
+
+/// A path as an argument.
+pub fn text(path: &Path) -> &str {
+    path.to_str().expect("a path of plain text")
+}
+
+/// A JSON file.
+pub fn json(path: &Path) -> Value {
+    let bytes = fs::read(path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
+    serde_json::from_slice(&bytes).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
+}
+
+/// Slugs of a report's reasons.
+pub fn reasons(report: &Value) -> Vec<&str> {
+    let list = report["reasons"].as_array().expect("report.reasons is a list");
+    list.iter().map(|reason| reason["type"].as_str().expect("a reason has a type")).collect()
+}
+
+fn table(path: &Path) -> Table {
+    let text = fs::read_to_string(path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
+    toml::from_str(&text).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
+}
+
+fn at<'a>(table: &'a mut Table, path: &[&str]) -> &'a mut Table {
+    path.iter().fold(table, |table, name| {
+        let entry = table.entry(*name).or_insert_with(|| toml::Value::Table(Table::new()));
+        entry.as_table_mut().expect("a table")
+    })
+}
+
+fn shrink_size(table: &mut Table) {
+    for side in table["size"].as_array_mut().expect("a size has two sides") {
+        *side = ((side.as_integer().expect("a side in pixels") as f64 / SCALE) as i64).into();
+    }
+}
+
+/// Pixel centres lie at integers, so that a coordinate shrinks about -1/2.
+fn shrink_coordinate(value: &mut toml::Value) {
+    let number = value.as_float().expect("a coordinate in pixels");
+    *value = ((number + 0.5) / SCALE - 0.5).into();
+}
+
+fn shrink_description(device: &mut Table) {
+    shrink_size(device);
+    let focal_px = device["focal_px"].as_float().expect("a focal length");
+    device.insert("focal_px".into(), (focal_px / SCALE).into());
+    if let Some(point) = device.get_mut("principal_point_px") {
+        point.as_array_mut().expect("a point").iter_mut().for_each(shrink_coordinate);
+    }
+}
+
+fn shrink_lens(lens: &mut Table) {
+    shrink_size(lens);
+    let rows = lens["matrix"].as_array_mut().expect("a matrix has rows");
+    for (index, row) in rows.iter_mut().take(2).enumerate() {
+        let row = row.as_array_mut().expect("a row of a matrix");
+        let focal_px = row[index].as_float().expect("a focal length");
+        row[index] = (focal_px / SCALE).into();
+        shrink_coordinate(&mut row[2]);
+    }
+}
