@@ -132,7 +132,7 @@ fn every_fault_is_found_and_named() {
         ("/projector/width", json!(9000), "outside 1..=8192"),
         ("/projector/width", json!(-1), "`projector.width`"),
         ("/code_bits/column", json!(9), "`code_bits.column`: 9 code bits and offset 0 cannot number 1024"),
-        ("/code_bits/column", json!(17), "17 code bits"),
+        ("/code_bits/column", json!(17), "17 bits"),
         ("/code_offset/column", json!(1), "10 code bits and offset 1 cannot number 1024"),
         ("/code_offset/row", json!(4_294_967_295u32), "cannot number 768"),
         ("/sequence", json!([]), "no code frames (role \"code\")"),
