@@ -51,7 +51,7 @@ pub fn decode(args: &DecodeArgs) -> Result<u8, Failure> {
     let writer = BundleWriter::create(args.out, Some(bundle.folder()), 0)
         .map_err(|error| Failure::storage("write the result", error))?;
     let frames = bundle.frames(&Limits::default()).map_err(|e| Failure::data(operation(), e))?;
-    bundle.verify().map_err(|e| Failure::data(operation(), e))?;
+    let unlike = bundle.verify(&frames).map_err(|e| Failure::data(operation(), e))?;
     let load_ms = start.elapsed().as_secs_f64() * 1e3;
 
     let (sequence, calibration) =
@@ -78,7 +78,7 @@ pub fn decode(args: &DecodeArgs) -> Result<u8, Failure> {
 
     let truth = bundle.truth((frames.width, frames.height)).map_err(|e| Failure::data(operation(), e))?;
     let capture = manifest.capture.as_ref().map(|capture| summary(&manifest.sequence, capture));
-    let notes: Vec<String> = bundle.notes().iter().chain(&frames.notes).cloned().collect();
+    let notes: Vec<String> = bundle.notes().iter().chain(&frames.notes).chain(&unlike).cloned().collect();
     let found: Vec<Reason> = manifest.capture.iter().flat_map(found).collect();
     let context = Context {
         truth: truth.as_ref(),
@@ -105,7 +105,7 @@ pub fn decode(args: &DecodeArgs) -> Result<u8, Failure> {
     }
     result.settings = manifest.settings.clone();
     result.capture = manifest.capture.clone();
-    result.source = Some(bundle.origin(&frames).map_err(|e| Failure::data(operation(), e))?);
+    result.source = Some(bundle.origin(&frames));
     result.processing = Some(Processing { regions: regions.clone(), ..processing });
     let report = results::write(writer, result, &results)?;
     results::print(&report, args.out, args.json);

@@ -4,7 +4,7 @@ use std::{
     fs::File,
     io::BufReader,
     path::{Path, PathBuf},
-    sync::Arc,
+    sync::{Arc, OnceLock},
 };
 
 use memmap2::Mmap;
@@ -55,6 +55,8 @@ pub struct FrameSet {
     /// What the report should say about them.
     pub notes: Vec<String>,
     files: Files,
+    /// Lengths and hashes, once somebody has asked for them.
+    hashes: OnceLock<Vec<SourceFile>>,
 }
 
 /// Where the samples came from.
@@ -76,10 +78,10 @@ impl std::fmt::Debug for FrameSet {
 }
 
 impl FrameSet {
-    /// Length and hash of each file the frames came from, of the very bytes that were decoded. Takes as long as reading
-    /// a mapped file once.
-    pub fn hashes(&self) -> Result<Vec<SourceFile>, InputError> {
-        Ok(match &self.files {
+    /// Length and hash of each file the frames came from, of the very bytes that were decoded. The first call
+    /// takes as long as reading a mapped file once.
+    pub fn hashes(&self) -> &[SourceFile] {
+        self.hashes.get_or_init(|| match &self.files {
             Files::Images(files) => files.clone(),
             Files::Npy { name, map } => {
                 let entry = FileEntry { bytes: map.len() as u64, sha256: hex(&Sha256::digest(&map[..])) };
@@ -271,6 +273,7 @@ fn load_npy(name: &str, path: &Path, policy: Policy, limits: &Limits) -> Result<
         planes: planes.collect(),
         notes: Vec::new(),
         files: Files::Npy { name: name.to_owned(), map },
+        hashes: OnceLock::new(),
     })
 }
 
@@ -344,6 +347,7 @@ fn load_images(
         planes,
         notes: notes.into_iter().collect(),
         files: Files::Images(files),
+        hashes: OnceLock::new(),
     })
 }
 

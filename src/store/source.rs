@@ -4,7 +4,7 @@ use std::{
     fs::{self, File},
     io::{self, Read},
     os::unix::fs::OpenOptionsExt,
-    path::{Path, PathBuf},
+    path::{Component, Path, PathBuf},
 };
 
 use polscan_patterns::Mode;
@@ -15,8 +15,8 @@ use thiserror::Error;
 use super::{
     error::{Fault, Faults, InputError},
     frames::{self, FrameSet, Limits},
-    manifest::{self, FileEntry, Manifest, Source, path_fault},
-    npz,
+    manifest::{self, FileEntry, Manifest, Source, SourceFile, path_fault},
+    maps, npz,
 };
 use crate::{
     geometry::{self, Calibration, CalibrationError, ReadHints},
@@ -113,7 +113,7 @@ impl Bundle {
     /// (width, height), and name only objects that the manifest lists.
     pub fn truth(&self, size: (usize, usize)) -> Result<Option<Truth>, InputError> {
         let Some(objects) = &self.manifest.truth_objects else { return Ok(None) };
-        let path = self.resolve(super::maps::TRUTH_FILE_NAME)?;
+        let path = self.resolve(maps::TRUTH_FILE_NAME)?;
         let mut arrays = npz::read(&open_regular(&path, self.policy, "read truth")?)
             .map_err(|detail| InputError::content(&path, detail))?;
         let mut floats = |name| arrays.take_f32(name).map_err(|detail| InputError::content(&path, detail));
@@ -141,41 +141,71 @@ impl Bundle {
         Ok(Some(Truth { column, row, depth_mm, object, objects: objects.clone() }))
     }
 
-    /// Compares every file with the size and hash that the manifest gives, and reports every difference.
-    pub fn verify(&self) -> Result<(), InputError> {
-        let faults: Vec<Fault> = self
+    /// Compares the files that a decode reads - `frames`, calibration and truth - with the sizes and hashes that the
+    /// manifest gives, and reports every difference; frames that lie elsewhere are compared with `source.frames`. What
+    /// is wrong with any other file changes no result and is returned as notes.
+    pub fn verify(&self, frames: &FrameSet) -> Result<Vec<String>, InputError> {
+        let hashes = frames.hashes();
+        let of_frame = |name: &str| hashes.iter().find(|file| same_file(&file.path, name));
+        let differences: Vec<(&String, String)> = self
             .manifest
             .files
             .par_iter()
             .filter_map(|(name, entry)| {
-                let found = self.resolve(name).and_then(|path| hash_file(&path, self.policy));
+                let found = match of_frame(name) {
+                    Some(file) => Ok(file.entry.clone()),
+                    None => self.resolve(name).and_then(|path| hash_file(&path, self.policy)),
+                };
                 let message = match found {
-                    Ok(found) if found.bytes != entry.bytes => {
-                        format!("has {} bytes, the manifest says {}", found.bytes, entry.bytes)
-                    }
-                    Ok(found) if !found.sha256.eq_ignore_ascii_case(&entry.sha256) => {
-                        "has another content than the manifest says".to_owned()
-                    }
-                    Ok(_) => return None,
+                    Ok(found) => difference(&found, entry, "the manifest")?,
                     Err(error) => error.to_string(),
                 };
-                Some(Fault::new(format!("files.{name}"), message))
+                Some((name, message))
             })
             .collect();
-        if faults.is_empty() {
-            return Ok(());
+        let is_read = |name: &str| {
+            of_frame(name).is_some()
+                || self.manifest.calibration.as_deref().is_some_and(|path| same_file(path, name))
+                || (self.manifest.truth_objects.is_some() && name == maps::TRUTH_FILE_NAME)
+        };
+        let (read, others): (Vec<_>, Vec<_>) = differences.into_iter().partition(|(name, _)| is_read(name));
+        let mut faults: Vec<Fault> =
+            read.into_iter().map(|(name, message)| Fault::new(format!("files.{name}"), message)).collect();
+        faults.extend(self.source_faults(hashes));
+        if !faults.is_empty() {
+            let path = self.folder.join(manifest::FILE_NAME);
+            return Err(InputError::Manifest { path, faults: Faults(faults) });
         }
-        Err(InputError::Manifest { path: self.folder.join(manifest::FILE_NAME), faults: Faults(faults) })
+        let note = |(name, message)| format!("the bundle's file `{name}`, which is not decoded: {message}");
+        Ok(others.into_iter().map(note).collect())
+    }
+
+    /// How frames that are no part of this bundle differ from those that it was made from.
+    fn source_faults(&self, hashes: &[SourceFile]) -> Vec<Fault> {
+        let Some(source) = &self.manifest.source else { return Vec::new() };
+        let own = |file: &SourceFile| self.manifest.files.keys().any(|name| same_file(name, &file.path));
+        if hashes.iter().all(own) {
+            return Vec::new();
+        }
+        if hashes.len() != source.frames.len() {
+            let message = format!("has {} entries for {} files of frames", source.frames.len(), hashes.len());
+            return vec![Fault::new("source.frames", message)];
+        }
+        let compare = |(index, (found, expected)): (usize, (&SourceFile, &SourceFile))| {
+            let message = difference(&found.entry, &expected.entry, "`source`")?;
+            Some(Fault::new(format!("source.frames[{index}]"), format!("{} {message}", found.path)))
+        };
+        hashes.iter().zip(&source.frames).enumerate().filter_map(compare).collect()
     }
 
     /// What the manifest of a decode of `frames` says about their origin.
-    pub fn origin(&self, frames: &FrameSet) -> Result<Source, InputError> {
-        Ok(Source {
+    pub fn origin(&self, frames: &FrameSet) -> Source {
+        Source {
             bundle: absolute(&self.folder).to_string_lossy().into_owned(),
             id: self.manifest.id.clone(),
             manifest_sha256: self.manifest_sha256.clone(),
-            frames: frames.hashes()?,
-        })
+            frames: frames.hashes().to_vec(),
+        }
     }
 
     /// The frames as a decode's own manifest names them: by paths that hold from any folder.
@@ -189,6 +219,21 @@ impl Bundle {
             }
         }
     }
+}
+
+/// Whether two paths of a manifest name the same file by their words.
+fn same_file(one: &str, other: &str) -> bool {
+    let words = |path| Path::new(path).components().filter(|part| *part != Component::CurDir);
+    words(one).eq(words(other))
+}
+
+/// How `found` differs from what `teller` says.
+fn difference(found: &FileEntry, expected: &FileEntry, teller: &str) -> Option<String> {
+    if found.bytes != expected.bytes {
+        return Some(format!("has {} bytes, {teller} says {}", found.bytes, expected.bytes));
+    }
+    let other = !found.sha256.eq_ignore_ascii_case(&expected.sha256);
+    other.then(|| format!("has another content than {teller} says"))
 }
 
 fn absolute(path: &Path) -> PathBuf {

@@ -67,10 +67,17 @@ fn names(folder: &Path) -> Vec<String> {
 
 const ALL: [&str; 5] = ["frames.npy", "manifest.json", "maps", "report.json", "truth.npz"];
 
+/// Loads and compares; the notes must be none.
+fn verify(bundle: &Bundle) -> Result<(), crate::store::InputError> {
+    let notes = bundle.verify(&bundle.frames(&Limits::default())?)?;
+    assert!(notes.is_empty(), "{notes:?}");
+    Ok(())
+}
+
 fn assert_whole(out: &Path) {
     assert_eq!(names(out), ALL);
     let bundle = Bundle::open(out, Policy::Upload, None).unwrap();
-    bundle.verify().unwrap();
+    verify(&bundle).unwrap();
     let listed: Vec<&String> = bundle.manifest().files.keys().collect();
     assert_eq!(listed, ["frames.npy", "maps/column.png", "maps/row.png", "report.json", "truth.npz"]);
     let frames = bundle.frames(&Limits::default()).unwrap();
@@ -239,7 +246,7 @@ fn a_process_that_dies_after_the_last_rename_leaves_a_finished_bundle() {
     assert!(remove_stale_partials(folder.path()).unwrap().is_empty());
     assert!(matches!(BundleWriter::create(&out, None, 0), Err(StorageError::Occupied { .. })));
     let bundle = Bundle::open(&out, Policy::Upload, None).unwrap();
-    bundle.verify().unwrap();
+    verify(&bundle).unwrap();
     assert!(!bundle.manifest().files.contains_key(".polscan-partial"));
 }
 
@@ -399,17 +406,48 @@ fn hashes_are_those_of_the_bytes_however_they_are_cut() {
     assert_eq!(fs::read(out.join("data")).unwrap(), data);
     let bundle = Bundle::open(&out, Policy::Local, None).unwrap();
     assert_eq!(bundle.manifest().files["data"].bytes, data.len() as u64);
-    bundle.verify().unwrap();
-    // A flipped bit, a lost file and a longer file are all found at once.
+    verify(&bundle).unwrap();
+    // What is not decoded is told, and stops nothing.
     let mut damaged = data;
     damaged[5] ^= 1;
     fs::write(out.join("data"), damaged).unwrap();
     fs::remove_file(out.join("report.json")).unwrap();
+    let frames = bundle.frames(&Limits::default()).unwrap();
+    let notes = bundle.verify(&frames).unwrap();
+    assert_eq!(notes.len(), 2, "{notes:?}");
+    assert!(notes[0].contains("`data`") && notes[0].contains("another content"), "{notes:?}");
+    assert!(notes[1].contains("`report.json`"), "{notes:?}");
+    // Wrong inputs are all found at once.
+    drop(frames);
     File::options().append(true).open(out.join("truth.npz")).unwrap().write_all(b"x").unwrap();
-    let error = bundle.verify().unwrap_err().to_string();
-    for part in ["`files.data`: has another content", "`files.report.json`", "`files.truth.npz`: has "] {
+    let mut bytes = fs::read(out.join("frames.npy")).unwrap();
+    *bytes.last_mut().unwrap() ^= 1;
+    fs::write(out.join("frames.npy"), bytes).unwrap();
+    let error = verify(&bundle).unwrap_err().to_string();
+    for part in ["`files.frames.npy`: has another content", "`files.truth.npz`: has "] {
         assert!(error.contains(part), "{error}");
     }
+    assert!(!error.contains("files.data"), "{error}");
+}
+
+#[test]
+fn a_calibration_that_was_changed_is_no_input() {
+    let folder = TempDir::new().unwrap();
+    let out = folder.path().join("scan");
+    let writer = BundleWriter::create(&out, None, 0).unwrap();
+    fill(&writer).unwrap();
+    writer.bytes(CALIBRATION_FILE_NAME, b"text").unwrap();
+    let named = Manifest { calibration: Some(format!("./{CALIBRATION_FILE_NAME}")), ..manifest() };
+    assert!(writer.finish(named).is_err(), "own files are named as they are listed");
+    let writer = BundleWriter::create(&out, None, 0).unwrap();
+    fill(&writer).unwrap();
+    writer.bytes(CALIBRATION_FILE_NAME, b"text").unwrap();
+    writer.finish(Manifest { calibration: Some(CALIBRATION_FILE_NAME.to_owned()), ..manifest() }).unwrap();
+    let bundle = Bundle::open(&out, Policy::Local, None).unwrap();
+    verify(&bundle).unwrap();
+    fs::write(out.join(CALIBRATION_FILE_NAME), b"test").unwrap();
+    let error = verify(&bundle).unwrap_err().to_string();
+    assert!(error.contains("`files.calibration.toml`: has another content"), "{error}");
 }
 
 #[test]
@@ -424,7 +462,7 @@ fn files_may_be_written_in_parallel() {
     writer.finish(manifest()).unwrap();
     let bundle = Bundle::open(&out, Policy::Local, None).unwrap();
     assert_eq!(bundle.manifest().files.len(), 45);
-    bundle.verify().unwrap();
+    verify(&bundle).unwrap();
 }
 
 #[test]

@@ -27,7 +27,7 @@ fn a_bundle_opens_by_its_folder_and_by_its_manifest() {
         assert_eq!(bundle.calibration().unwrap().unwrap().1, b"text");
         assert_eq!(bundle.notes(), ["the manifest's key `note` is unknown and was ignored"]);
         assert!(bundle.truth((1, 1)).unwrap().is_none());
-        let origin = bundle.origin(&frames).unwrap();
+        let origin = bundle.origin(&frames);
         assert_eq!(origin.frames[1].path, "sub/b.pgm");
         assert_eq!(origin.frames[1].entry.bytes, 12);
         let manifest = fs::read(folder.path().join("manifest.json")).unwrap();
@@ -47,6 +47,36 @@ fn absolute_frames_lead_to_the_same_files_from_elsewhere() {
     let again = Bundle::open(elsewhere.path(), Policy::Local, None).unwrap();
     assert_eq!(again.frames(&Limits::default()).unwrap().planes.len(), 2);
     assert!(Bundle::open(elsewhere.path(), Policy::Upload, None).is_err());
+}
+
+#[test]
+fn frames_elsewhere_are_compared_with_those_of_the_source() {
+    let (folder, elsewhere) = (TempDir::new().unwrap(), TempDir::new().unwrap());
+    capture(folder.path());
+    let bundle = Bundle::open(folder.path(), Policy::Local, None).unwrap();
+    let frames = bundle.frames(&Limits::default()).unwrap();
+    assert!(bundle.verify(&frames).unwrap().is_empty());
+    let source = bundle.origin(&frames);
+    let check = |source: Source| {
+        let manifest = Manifest {
+            frames: bundle.absolute_frames(),
+            calibration: None,
+            source: Some(source),
+            ..bundle.manifest().clone()
+        };
+        fs::write(elsewhere.path().join("manifest.json"), manifest.to_json().unwrap()).unwrap();
+        let again = Bundle::open(elsewhere.path(), Policy::Local, None).unwrap();
+        again.verify(&again.frames(&Limits::default()).unwrap()).map_err(|error| error.to_string())
+    };
+    assert!(check(source.clone()).unwrap().is_empty());
+    let mut fewer = source.clone();
+    fewer.frames.pop();
+    let error = check(fewer).unwrap_err();
+    assert!(error.contains("`source.frames`: has 1 entries for 2 files"), "{error}");
+    fs::write(folder.path().join("sub/b.pgm"), b"P5 1 1 255\n\x11").unwrap();
+    let error = check(source).unwrap_err();
+    assert!(error.contains("`source.frames[1]`") && error.contains("another content"), "{error}");
+    assert!(!error.contains("frames[0]"), "{error}");
 }
 
 #[test]
