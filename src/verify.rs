@@ -35,7 +35,24 @@ pub fn shared_plane(frame: &Frame) -> SharedPlane {
     Arc::new(FramePlane(frame.store.clone()))
 }
 
+/// Pairs that a noise model is estimated from, one after the other.
+const NOISE_PAIRS: u32 = 4;
+/// Pairs that are kept to tell which of two that disagree is the wrong one.
+const WITNESSES: usize = 4;
+
+/// A pair, the frame first and its inverse second.
+#[derive(Clone)]
+struct Pair {
+    axis: Axis,
+    bit: u8,
+    frames: [Frame; 2],
+}
+
 /// Judges pairs by their pair sum and last references by the first ones.
+///
+/// Where there are no two references, as in mode paper, the first pair takes their place, since any pair sums to the
+/// same light. It is provisional until another agrees with it; pairs that contradict it but agree with each other
+/// displace it.
 pub struct PairSumJudge {
     sequence: Sequence,
     camera: CameraResponse,
@@ -43,9 +60,16 @@ pub struct PairSumJudge {
     limits: PairThresholds,
     high: Option<Frame>,
     low: Option<Frame>,
-    /// Pair against which the next one is compared where there are no two references, as in mode paper.
-    first_pair: Option<[Frame; 2]>,
+    first_pair: Option<Pair>,
+    /// Whether a pair has agreed with the first one, the noise being known.
+    first_holds: bool,
+    /// Pairs since the first one, as long as that is provisional.
+    witnesses: Vec<Pair>,
     noise: Option<NoiseModel>,
+    /// Pairs that the noise has been estimated from.
+    noise_pairs: u32,
+    /// The pair before, as long as noise is estimated.
+    last_pair: Option<Pair>,
 }
 
 impl PairSumJudge {
@@ -60,22 +84,154 @@ impl PairSumJudge {
             high: None,
             low: None,
             first_pair: None,
+            first_holds: false,
+            witnesses: Vec::new(),
+            noise_pairs: 0,
+            last_pair: None,
         }
     }
 
-    /// Calibrated noise, or noise estimated from the first frames that sum to the same light.
-    fn noise(&mut self, width: usize, frame: &Frame, inverse: &Frame) -> Option<NoiseModel> {
-        if self.noise.is_none() {
-            let earlier = match (&self.high, &self.low, &self.first_pair) {
-                (Some(high), Some(low), _) => [high, low],
-                (_, _, Some([first, second])) => [first, second],
-                _ => return None,
-            };
-            let pairs = [earlier.map(|f| plane(f.pixels())), [frame, inverse].map(|f| plane(f.pixels()))];
-            self.noise = estimate_noise(&pairs, width, &self.camera);
-        }
-        self.noise
+    /// Whether the noise is calibrated or no longer estimated anew.
+    fn noise_settled(&self) -> bool {
+        self.camera.noise.is_some() || self.noise_pairs >= NOISE_PAIRS
     }
+
+    /// Frames that sum to the light of every pair.
+    fn levels(&self) -> Option<[&Frame; 2]> {
+        match (&self.high, &self.low, &self.first_pair) {
+            (Some(high), Some(low), _) => Some([high, low]),
+            (_, _, Some(first)) => Some(first.frames.each_ref()),
+            _ => None,
+        }
+    }
+
+    /// Estimates the noise from `pair` too and keeps the smallest: a frame that shows another picture only inflates it.
+    fn learn_noise(&mut self, pair: &Pair) {
+        if self.noise_settled() {
+            return;
+        }
+        let Some(levels) = self.levels() else { return };
+        let light = brightness(pair.frames.each_ref()) - self.camera.black_level_dn.unwrap_or(0.0);
+        let earlier = [Some(levels), self.last_pair.as_ref().map(|last| last.frames.each_ref())];
+        let smallest = earlier
+            .into_iter()
+            .flatten()
+            .filter_map(|earlier| {
+                let pairs = [earlier, pair.frames.each_ref()].map(|two| two.map(|f| plane(f.pixels())));
+                estimate_noise(&pairs, pair.frames[0].width as usize, &self.camera)
+            })
+            .min_by(|one, other| one.variance(light).total_cmp(&other.variance(light)));
+        self.last_pair = Some(pair.clone());
+        if let Some(found) = smallest {
+            self.noise_pairs += 1;
+            let smaller = |known: NoiseModel| found.variance(light) < known.variance(light);
+            if self.noise.is_none_or(smaller) {
+                self.noise = Some(found);
+            }
+        }
+        if self.noise_settled() {
+            self.last_pair = None;
+        }
+    }
+
+    /// Verdict on two frames of `axis` and `bit` by the light of `levels`, `None` where there is no telling.
+    fn judge(&self, axis: Axis, bit: u8, frames: [&Frame; 2], levels: [&Frame; 2]) -> Option<PairVerdict> {
+        let [high, low] = levels.map(|frame| plane(frame.pixels()));
+        let context = PairContext {
+            axis,
+            bit,
+            width: frames[0].width as usize,
+            high: &[high],
+            low: &[low],
+            camera: self.camera,
+            noise: self.noise?,
+            lit_sigma: self.thresholds.lit_sigma,
+        };
+        let [frame, inverse] = frames.map(|frame| plane(frame.pixels()));
+        let residual = pair_residual(frame, inverse, &context)?;
+        Some(judge_rule(&residual, self.sequence.code(axis).bits(), &self.limits))
+    }
+
+    /// Verdict on `pair` by `other` where either may be the wrong one.
+    fn compare(&self, pair: &Pair, other: &Pair) -> Option<PairVerdict> {
+        let (frames, others) = (pair.frames.each_ref(), other.frames.each_ref());
+        let verdict = self.judge(pair.axis, pair.bit, frames, others)?;
+        if matches!(verdict, PairVerdict::Retake(_)) {
+            return Some(verdict);
+        }
+        // Two frames of one picture light no pixel in their difference: only the other way round is that seen.
+        match self.judge(pair.axis, pair.bit, others, frames)? {
+            PairVerdict::Retake(suspicion) => Some(PairVerdict::Retake(suspicion)),
+            _ => Some(verdict),
+        }
+    }
+
+    fn agree(&self, pair: &Pair, other: &Pair) -> bool {
+        self.compare(pair, other).is_some_and(|verdict| verified(&verdict))
+    }
+
+    /// Verdict on `pair` by the first pair, which it may displace.
+    fn against_first(&mut self, pair: Pair) -> Option<PairVerdict> {
+        let Some(first) = &self.first_pair else {
+            self.first_pair = Some(pair);
+            return Some(PairVerdict::Accept);
+        };
+        if self.first_holds {
+            return self.judge(pair.axis, pair.bit, pair.frames.each_ref(), first.frames.each_ref());
+        }
+        let verdict = self.compare(&pair, first)?;
+        let mut holds = verified(&verdict);
+        let verdict = match verdict {
+            PairVerdict::Retake(suspicion) => {
+                let votes = |side: &Pair| self.witnesses.iter().filter(|w| self.agree(side, w)).count();
+                if votes(&pair) > votes(first) {
+                    let evidence = format!(
+                        "{} bit {}: the first pair, which nothing had verified, is contradicted by pairs that agree \
+                         with each other; {}",
+                        first.axis, first.bit, suspicion.evidence
+                    );
+                    self.first_pair = Some(pair.clone());
+                    holds = true;
+                    let reason = "unverified-pair".into();
+                    PairVerdict::Degraded(Suspicion { reason, evidence, sigma: suspicion.sigma })
+                } else {
+                    PairVerdict::Retake(suspicion)
+                }
+            }
+            verdict => verdict,
+        };
+        self.first_holds = holds && self.noise_settled();
+        if self.first_holds {
+            self.witnesses.clear();
+        } else {
+            if self.witnesses.len() == WITNESSES {
+                self.witnesses.remove(0);
+            }
+            self.witnesses.push(pair);
+        }
+        Some(verdict)
+    }
+}
+
+/// Whether a verdict says that the frames show what they should, if not perfectly.
+fn verified(verdict: &PairVerdict) -> bool {
+    match verdict {
+        PairVerdict::Accept => true,
+        PairVerdict::Degraded(suspicion) => suspicion.reason != "unverified-pair",
+        PairVerdict::Retake(_) => false,
+    }
+}
+
+/// Mean of about ten thousand samples of each frame, in DN.
+fn brightness(frames: [&Frame; 2]) -> f64 {
+    let (mut sum, mut count) = (0.0, 0.0);
+    for pixels in frames.map(Frame::pixels) {
+        for index in (0..pixels.len()).step_by((pixels.len() / 10_000).max(1)) {
+            sum += f64::from(pixels.get(index));
+            count += 1.0;
+        }
+    }
+    if count > 0.0 { sum / count } else { 0.0 }
 }
 
 impl Judge for PairSumJudge {
@@ -88,38 +244,19 @@ impl Judge for PairSumJudge {
     }
 
     fn pair(&mut self, axis: Axis, bit: u8, frame: &Frame, inverse: &Frame) -> PairVerdict {
-        let width = frame.width as usize;
-        let noise = self.noise(width, frame, inverse);
-        // Without two references the first pair takes their place: any pair sums to the same light.
-        let (high, low) = match (&self.high, &self.low, &self.first_pair) {
-            (Some(high), Some(low), _) => (high, low),
-            (_, _, Some([first, second])) => (first, second),
-            _ => {
-                self.first_pair = Some([frame.clone(), inverse.clone()]);
-                return PairVerdict::Accept;
-            }
+        let pair = Pair { axis, bit, frames: [frame.clone(), inverse.clone()] };
+        self.learn_noise(&pair);
+        let verdict = match (&self.high, &self.low) {
+            (Some(high), Some(low)) => self.judge(axis, bit, [frame, inverse], [high, low]),
+            _ => self.against_first(pair),
         };
-        let residual = noise.and_then(|noise| {
-            let context = PairContext {
-                axis,
-                bit,
-                width,
-                high: &[plane(high.pixels())],
-                low: &[plane(low.pixels())],
-                camera: self.camera,
-                noise,
-                lit_sigma: self.thresholds.lit_sigma,
-            };
-            pair_residual(plane(frame.pixels()), plane(inverse.pixels()), &context)
-        });
-        match residual {
-            Some(residual) => judge_rule(&residual, self.sequence.code(axis).bits(), &self.limits),
-            None => PairVerdict::Degraded(Suspicion {
+        verdict.unwrap_or_else(|| {
+            PairVerdict::Degraded(Suspicion {
                 reason: "unverified-pair".into(),
                 evidence: format!("{axis} bit {bit}: too little light to judge the pair"),
                 sigma: 0.0,
-            }),
-        }
+            })
+        })
     }
 
     fn drift(&mut self, role: Role, first: &Frame, last: &Frame) -> PairVerdict {
@@ -134,3 +271,6 @@ impl Judge for PairSumJudge {
         }
     }
 }
+
+#[cfg(test)]
+mod tests;

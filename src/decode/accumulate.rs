@@ -56,8 +56,8 @@ impl Accumulator {
         {
             return refuse("thresholds must be finite and positive".into());
         }
-        if thresholds.fit_edges < 2 {
-            return refuse(format!("a line needs at least 2 edges, not {}", thresholds.fit_edges));
+        if !(2..=64).contains(&thresholds.fit_edges) {
+            return refuse(format!("a fit takes 2 to 64 edges, not {}", thresholds.fit_edges));
         }
         Ok(Self { settings, frames: Vec::new() })
     }

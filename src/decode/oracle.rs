@@ -127,7 +127,10 @@ pub fn decode_pixel(settings: &DecodeSettings, noise: NoiseModel, samples: &Pixe
             1 => match spans[..] {
                 [(a, b), (c, d)] if b + 1 == c || d + 1 == a => edge = true,
                 [_, _] => ambiguous = true,
-                [_] => edge = true,
+                [_] => match readings(&word, &soft).iter().map(|word| place(word)).collect::<Vec<_>>()[..] {
+                    [one, other] if one + 1 == other || other + 1 == one => edge = true,
+                    _ => ambiguous = true,
+                },
                 _ => outside = true,
             },
             _ => ambiguous = true,
@@ -163,6 +166,16 @@ fn readings(word: &[bool], soft: &[bool]) -> Vec<Vec<bool>> {
         readings.push(word.iter().zip(soft).map(|(bit, soft)| bit ^ soft).collect());
     }
     readings
+}
+
+/// Place of a word in the list of all words as it is written down by reflection: first the shorter list behind a 0,
+/// then the same list backwards behind a 1.
+fn place(word: &[bool]) -> u32 {
+    match word {
+        [] => 0,
+        [false, rest @ ..] => place(rest),
+        [true, rest @ ..] => (1 << word.len()) - 1 - place(rest),
+    }
 }
 
 /// First and last index whose word begins with these bits.

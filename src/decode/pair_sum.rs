@@ -26,6 +26,10 @@ const ROWS: usize = 300;
 const ROWS_OF_CHECK: usize = 100;
 /// A pixel this near to a stripe edge (in px, along x and y) is not flat.
 const NEAR_EDGE: usize = 2;
+/// Below this many sigma of P - Q it is open which of the two is the brighter.
+const OPEN_SIGMA: f32 = 3.0;
+/// Open pixels, of the nine looked at for an edge, that are no stripe edge: both frames show the same there.
+const OPEN_PIXELS: usize = 6;
 const OUTLIER_SIGMA: f32 = 5.0;
 const BINS_PER_SIGMA: f32 = 64.0;
 const RANGE_SIGMA: f32 = 64.0;
@@ -228,6 +232,11 @@ fn typed_residual<T: Sample>(p: Plane<'_>, q: Plane<'_>, context: &PairContext<'
     let (width, height) = (context.width, p.len() / context.width);
     let mut tally = Tally::new();
     let above = |at: usize| p[at].dn() > q[at].dn();
+    // Where a stale frame equals its partner noise alone decides which is above, and would feign edges everywhere.
+    let open = |at: usize| {
+        let (p, q) = (p[at].dn() as f32, q[at].dn() as f32);
+        (p - q).powi(2) < OPEN_SIGMA * OPEN_SIGMA * (gates.variance(p) + gates.variance(q))
+    };
     for y in sampled_rows(height, ROWS_OF_CHECK) {
         for x in 0..width {
             let at = y * width + x;
@@ -237,7 +246,8 @@ fn typed_residual<T: Sample>(p: Plane<'_>, q: Plane<'_>, context: &PairContext<'
             }
             let Some(expected) = from_references(&high, &low, at, &gates) else { continue };
             let here = above(at);
-            let flat = neighbours(x, y, width, height).all(|other| above(other) == here);
+            let flat = neighbours(x, y, width, height).all(|other| above(other) == here)
+                || neighbours(x, y, width, height).chain([at]).filter(|&at| open(at)).count() >= OPEN_PIXELS;
             let residual = (dn_p + dn_q) as f32 - expected.sum + dither(at);
             tally.add(residual * expected.per_sigma, flat);
         }

@@ -243,7 +243,7 @@ fn tell_losses<T>(
 }
 
 /// Binary value of a reflected Gray word: each bit is the parity of the word's bits from the top down to it.
-fn binary_of_gray(word: u16) -> u16 {
+pub(crate) fn binary_of_gray(word: u16) -> u16 {
     let value = word ^ (word >> 8);
     let value = value ^ (value >> 4);
     let value = value ^ (value >> 2);

@@ -15,7 +15,7 @@ use rayon::prelude::*;
 use super::{
     kernels::{WEAK_BIT_SHIFT, pair_bit, pair_sum, track_weakest},
     limits::Gates,
-    plan::{AxisFrames, BitFrames, Frames, Levels, PrefixCode},
+    plan::{AxisFrames, BitFrames, Frames, Levels, PrefixCode, binary_of_gray},
     sample::Sample,
     types::Class,
 };
@@ -380,7 +380,8 @@ impl Scratch {
     }
 }
 
-/// Value of a word (`values` by word, negative outside the projector) with at most one soft bit. A single soft bit is an edge where both readings are neighbours.
+/// Value of a word (`values` by word, negative outside the projector) with at most one soft bit. A single soft bit is
+/// an edge where both readings are neighbours, of which one may lie just beyond the rim of the projector.
 fn resolve_word(values: &[i32], word: u16, soft: u16) -> (i32, Status) {
     let read = values[usize::from(word)];
     if soft == 0 {
@@ -388,13 +389,15 @@ fn resolve_word(values: &[i32], word: u16, soft: u16) -> (i32, Status) {
     }
     let inside = |value: i32| (value >= 0).then_some(value);
     match soft.count_ones() {
-        1 => match (inside(read), inside(values[usize::from(word ^ soft)])) {
-            (Some(one), Some(other)) if one.abs_diff(other) == 1 => (one, Status::Edge),
-            (Some(_), Some(_)) => (-1, Status::Ambiguous),
-            // At the rim of the projector only one reading exists.
-            (Some(inside), None) | (None, Some(inside)) => (inside, Status::Edge),
-            (None, None) => (-1, Status::Outside),
-        },
+        1 => {
+            let other = word ^ soft;
+            let neighbours = binary_of_gray(word).abs_diff(binary_of_gray(other)) == 1;
+            match inside(read).or(inside(values[usize::from(other)])) {
+                None => (-1, Status::Outside),
+                Some(value) if neighbours => (value, Status::Edge),
+                Some(_) => (-1, Status::Ambiguous),
+            }
+        }
         _ => (-1, Status::Ambiguous),
     }
 }
@@ -409,4 +412,54 @@ fn boundary_distance(code: PrefixCode, bit: u8, value: i32) -> i32 {
     let half = 1i32 << (code.bits - 1 - bit);
     let within = value & (2 * half - 1);
     if within < half { half - 1 - within } else { within - half }
+}
+
+#[cfg(test)]
+mod tests {
+    use polscan_patterns::AxisCode;
+
+    use super::*;
+
+    /// All words in order, by reflection.
+    fn words(bits: u8) -> Vec<u16> {
+        (0..bits).fold(vec![0], |list: Vec<u16>, bit| {
+            let again = list.iter().rev().map(|word| word | 1 << bit);
+            list.iter().copied().chain(again).collect()
+        })
+    }
+
+    #[test]
+    fn a_soft_bit_is_an_edge_only_between_neighbours() {
+        let (mut rims, mut strangers) = (0, 0);
+        for size in [1, 2, 3, 5, 12, 17, 100, 768, 1024] {
+            let whole = AxisCode::centred(size).unwrap();
+            for known in 1..=whole.bits() {
+                let code = PrefixCode::new(whole, known);
+                let list = words(known);
+                let inside = |place: usize| code.span(place as i32).is_some();
+                let mut values = vec![-1; list.len()];
+                for place in (0..list.len()).filter(|&place| inside(place)) {
+                    values[usize::from(list[place])] = place as i32;
+                }
+                for (place, &word) in list.iter().enumerate() {
+                    for bit in 0..known {
+                        let other = list.iter().position(|&found| found == word ^ (1 << bit)).unwrap();
+                        let found = resolve_word(&values, word, 1 << bit);
+                        let here = if inside(place) { place } else { other };
+                        let expected = match (inside(place), inside(other)) {
+                            (false, false) => (-1, Status::Outside),
+                            _ if place.abs_diff(other) == 1 => (here as i32, Status::Edge),
+                            _ => (-1, Status::Ambiguous),
+                        };
+                        assert_eq!(found, expected, "{size} px, {known} bits: {word:b} bit {bit}");
+                        if inside(place) != inside(other) {
+                            rims += u32::from(expected.1 == Status::Edge);
+                            strangers += u32::from(expected.1 == Status::Ambiguous);
+                        }
+                    }
+                }
+            }
+        }
+        assert!(rims > 10 && strangers > 10, "{rims} {strangers}");
+    }
 }

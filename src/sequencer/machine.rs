@@ -328,7 +328,9 @@ impl Machine {
                 self.repeat_judged(subject, suspicion)
             }
             // What has changed since the first references stays changed: the scan says so and stands.
-            PairVerdict::Retake(suspicion) if matches!(subject, Subject::Drift { .. }) => {
+            PairVerdict::Retake(suspicion)
+                if matches!(subject, Subject::Drift { .. }) && !shows_another_picture(&suspicion) =>
+            {
                 self.findings.push(finding(suspicion));
                 vec![Action::Accept { group }]
             }
@@ -454,6 +456,11 @@ impl Machine {
         self.phase = Phase::Ended;
         vec![Action::Black, Action::Finish(outcome)]
     }
+}
+
+/// Whether a frame is not the one that was asked for: as a reference it would spoil the mean of the good ones.
+fn shows_another_picture(suspicion: &Suspicion) -> bool {
+    matches!(suspicion.reason.as_str(), "stale-frame" | "torn-frame")
 }
 
 #[cfg(test)]

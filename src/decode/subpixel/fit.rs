@@ -216,7 +216,10 @@ impl Segments {
         let after = self.of_edge.get(passed).copied();
         let fit = |(start, end): (usize, usize)| {
             let of = |count| window(start, end, passed, count);
-            fit_windows(edges, &Windows { wide: of(WIDE * fit_edges), line: of(fit_edges), short: of(SHORT) })
+            fit_windows(
+                edges,
+                &Windows { wide: of(WIDE.saturating_mul(fit_edges)), line: of(fit_edges), short: of(SHORT) },
+            )
         };
         match (before, after) {
             (Some(before), Some(after)) if before == after => [fit(before), None],
@@ -228,7 +231,7 @@ impl Segments {
 /// Up to `count` edges of `start..end` around the interval before edge `passed`.
 fn window(start: usize, end: usize, passed: usize, count: usize) -> Range<usize> {
     let first = passed.saturating_sub(count / 2).min(end.saturating_sub(count)).max(start);
-    first..(first + count).min(end)
+    first..first.saturating_add(count).min(end)
 }
 
 /// Whether the surface jumps between edges `next - 1` and `next`: the lines through the edges of either side
@@ -258,5 +261,31 @@ fn jumps(edges: &[Edge], start: usize, next: usize) -> bool {
         (Some(left), None) => disagree(left.at(edges[next].position), (edges[next].u, 0.0)),
         (None, Some(right)) => disagree(right.at(edges[next - 1].position), (edges[next - 1].u, 0.0)),
         (None, None) => false,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn any_number_of_edges_can_be_asked_for() {
+        let edges: Vec<Edge> = (0..12)
+            .map(|index| Edge {
+                position: 3.0 * f64::from(index),
+                weight: 100.0,
+                u: f64::from(index) + 0.5,
+                rising: index % 2 == 0,
+            })
+            .collect();
+        let mut segments = Segments::default();
+        segments.split(&edges);
+        for passed in 0..=edges.len() {
+            let all = segments.fits(&edges, passed, edges.len());
+            assert!(all.iter().any(Option::is_some));
+            for many in [usize::MAX, usize::MAX / 2 + 1, usize::MAX - 3] {
+                assert_eq!(segments.fits(&edges, passed, many), all);
+            }
+        }
     }
 }

@@ -7,8 +7,8 @@ use polscan_patterns::{Axis, AxisCode, Mode, ProjectorSize, Role, Sequence};
 use super::synth::{Rig, Spot, accuracy, decode, normal, sequence};
 use crate::{
     decode::{
-        Accumulator, Class, Contrast, DecodeError, DecodeSettings, Decoded, PairContext, Plane, contrast,
-        estimate_noise, pair_residual,
+        Accumulator, Class, Contrast, DecodeError, DecodeSettings, Decoded, PairContext, Plane, Thresholds,
+        contrast, estimate_noise, pair_residual,
     },
     grid::Grid,
 };
@@ -370,6 +370,30 @@ fn frames_that_do_not_belong_are_refused() {
         },
     ] {
         assert!(matches!(Accumulator::new(broken), Err(DecodeError::Settings { .. })));
+    }
+}
+
+#[test]
+fn thresholds_that_nothing_can_be_decoded_with_are_refused() {
+    let settings = rig().settings(&sequence(Mode::Pse));
+    let accepts = |change: &dyn Fn(&mut Thresholds)| {
+        let mut settings = settings.clone();
+        change(&mut settings.thresholds);
+        match Accumulator::new(settings) {
+            Ok(_) => true,
+            Err(DecodeError::Settings { .. }) => false,
+            Err(other) => panic!("{other}"),
+        }
+    };
+    for (edges, usable) in
+        [(0, false), (1, false), (2, true), (8, true), (64, true), (65, false), (usize::MAX, false)]
+    {
+        assert_eq!(accepts(&|thresholds| thresholds.fit_edges = edges), usable, "{edges}");
+    }
+    for value in [0.0, -1.0, f64::NAN, f64::INFINITY] {
+        assert!(!accepts(&|thresholds| thresholds.lit_sigma = value), "{value}");
+        assert!(!accepts(&|thresholds| thresholds.soft_bit_sigma = value), "{value}");
+        assert!(!accepts(&|thresholds| thresholds.snap_px = value), "{value}");
     }
 }
 

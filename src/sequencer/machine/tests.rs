@@ -359,6 +359,23 @@ fn references_that_stay_changed_are_reported_and_do_not_fail_the_scan() {
 }
 
 #[test]
+fn a_last_reference_that_keeps_showing_another_picture_fails_the_scan() {
+    for reason in ["stale-frame", "torn-frame"] {
+        let mut story = Story::begin(Mode::Pse);
+        for _ in 0..3 {
+            story.until(|action| *action == Action::Judge(Subject::Drift { group: 6 }));
+            story.tell(Event::Judged(Subject::Drift { group: 6 }, suspicious(reason)));
+        }
+        let diagnosis = story.failure();
+        assert_eq!(diagnosis.reason, reason);
+        assert!(matches!(diagnosis.role, Some(Role::ReferenceH | Role::ReferenceV)), "{diagnosis:?}");
+        assert_eq!(story.retakes().len(), 2);
+        assert!(!story.trace.contains(&Action::Accept { group: 6 }));
+        assert!(story.machine.findings().is_empty());
+    }
+}
+
+#[test]
 fn a_frame_of_an_earlier_slide_is_dropped_and_the_right_one_awaited() {
     let mut story = Story::begin(Mode::Pse);
     story.lose_frame(4);

@@ -1,0 +1,147 @@
+use polscan_drivers::{clock::Timestamp, frame::FrameStamp};
+use polscan_patterns::{Mode, ProjectorSize};
+
+use super::*;
+use crate::decode::tests::synth::{normal, random};
+
+const WIDTH: usize = 400;
+const HEIGHT: usize = 60;
+const NOISE: NoiseModel = NoiseModel { gain_dn_per_electron: 0.4, read_noise_dn: 2.0 };
+
+fn judge(mode: Mode, noise: Option<NoiseModel>) -> PairSumJudge {
+    let camera = CameraResponse { bit_depth: 12, black_level_dn: None, saturation_dn: 4095, noise };
+    let sequence = Sequence::new(mode, ProjectorSize { width: 1024, height: 768 }).unwrap();
+    PairSumJudge::new(sequence, camera, Thresholds::default())
+}
+
+/// A frame of 100 DN, 1100 DN where `lit`, with the noise of the camera.
+fn shot(seed: u64, lit: impl Fn(usize) -> bool) -> Frame {
+    let samples: Vec<u16> = (0..WIDTH * HEIGHT)
+        .map(|at| {
+            let level = if lit(at % WIDTH) { 1100.0 } else { 100.0 };
+            let sigma = (NOISE.variance(level) - 1.0 / 12.0).sqrt();
+            (level + sigma * normal(random(seed) ^ random(at as u64 + 77))).round() as u16
+        })
+        .collect();
+    let (received, exposure_start) = (Timestamp(0), Timestamp(0));
+    let stamp = FrameStamp { frame_id: seed, trigger: seed, exposure_start, received, device_time_ns: None };
+    Frame { width: WIDTH as u32, height: HEIGHT as u32, bit_depth: 12, stamp, store: Arc::new(samples) }
+}
+
+fn set(bit: u8, x: usize) -> bool {
+    let index = x * 1024 / WIDTH;
+    ((index ^ (index >> 1)) >> (9 - bit)) & 1 == 1
+}
+
+fn good(bit: u8, seed: u64) -> [Frame; 2] {
+    [shot(seed, |x| set(bit, x)), shot(seed + 1, |x| !set(bit, x))]
+}
+
+/// The frame still shows the slide before it: the inverse of the bit before, or the dark reference.
+fn stale_direct(bit: u8, seed: u64) -> [Frame; 2] {
+    [shot(seed, |x| bit > 0 && !set(bit - 1, x)), shot(seed + 1, |x| !set(bit, x))]
+}
+
+/// The inverse still shows the frame.
+fn stale_inverse(bit: u8, seed: u64) -> [Frame; 2] {
+    [shot(seed, |x| set(bit, x)), shot(seed + 1, |x| set(bit, x))]
+}
+
+type Make = fn(u8, u64) -> [Frame; 2];
+
+/// Verdicts on pairs one after the other, as `accept` or reason.
+fn verdicts(judge: &mut PairSumJudge, pairs: &[(u8, Make)]) -> Vec<String> {
+    let mut seed = 1000;
+    let mut all = Vec::new();
+    for (bit, make) in pairs {
+        seed += 10;
+        let [frame, inverse] = make(*bit, seed);
+        all.push(match judge.pair(Axis::Column, *bit, &frame, &inverse) {
+            PairVerdict::Accept => "accept".into(),
+            PairVerdict::Degraded(found) if found.reason == "unverified-pair" => found.evidence,
+            PairVerdict::Degraded(found) => found.reason,
+            PairVerdict::Retake(_) => "retake".into(),
+        });
+    }
+    all
+}
+
+const NOISES: [Option<NoiseModel>; 2] = [Some(NOISE), None];
+
+#[test]
+fn stale_frames_of_coarse_bits_are_taken_again() {
+    for stale in [stale_direct as Make, stale_inverse] {
+        let mut judge = judge(Mode::Pse, Some(NOISE));
+        judge.reference(Role::ReferenceV, &shot(1, |_| false));
+        judge.reference(Role::ReferenceH, &shot(2, |_| true));
+        for bit in 0..7 {
+            assert_eq!(verdicts(&mut judge, &[(bit, stale)]), ["retake"], "bit {bit}");
+            assert_eq!(verdicts(&mut judge, &[(bit, good)]), ["accept"], "bit {bit}");
+        }
+    }
+}
+
+#[test]
+fn without_references_good_pairs_are_accepted() {
+    for noise in NOISES {
+        let pairs: Vec<(u8, Make)> = (0..7).map(|bit| (bit, good as Make)).collect();
+        assert_eq!(verdicts(&mut judge(Mode::Paper, noise), &pairs), ["accept"; 7]);
+    }
+}
+
+#[test]
+fn a_wrong_first_pair_is_displaced_and_named() {
+    for noise in NOISES {
+        for stale in [stale_direct as Make, stale_inverse] {
+            let mut judge = judge(Mode::Paper, noise);
+            let pairs: Vec<(u8, Make)> =
+                [(0, stale), (1, good), (2, good), (1, good), (3, good), (4, good), (5, good)].into();
+            let found = verdicts(&mut judge, &pairs);
+            assert_eq!(found[..2], ["accept", "retake"], "{found:?}");
+            assert!(found[2].starts_with("column bit 0: the first pair"), "{found:?}");
+            assert_eq!(found[3..], ["accept"; 4], "{found:?}");
+            assert_eq!(verdicts(&mut judge, &[(6, stale_inverse)]), ["retake"]);
+        }
+    }
+}
+
+#[test]
+fn a_second_pair_that_disagrees_twice_displaces_the_first() {
+    let pairs: [(u8, Make); 4] = [(0, stale_inverse), (1, good), (1, good), (2, good)];
+    let found = verdicts(&mut judge(Mode::Paper, Some(NOISE)), &pairs);
+    assert_eq!(found[1], "retake");
+    assert!(found[2].starts_with("column bit 0: the first pair"), "{found:?}");
+    assert_eq!(found[3], "accept");
+}
+
+#[test]
+fn a_wrong_later_pair_leaves_a_good_first_one_in_place() {
+    for noise in NOISES {
+        let pairs: [(u8, Make); 6] =
+            [(0, good), (1, stale_inverse), (2, good), (1, good), (3, stale_direct), (3, good)];
+        let found = verdicts(&mut judge(Mode::Paper, noise), &pairs);
+        assert_eq!(found, ["accept", "retake", "accept", "accept", "retake", "accept"]);
+        // Two wrong ones at once, which agree neither with the first nor with each other.
+        let pairs: [(u8, Make); 5] =
+            [(0, good), (1, stale_inverse), (2, stale_inverse), (1, good), (2, good)];
+        let found = verdicts(&mut judge(Mode::Paper, noise), &pairs);
+        assert_eq!(found, ["accept", "retake", "retake", "accept", "accept"]);
+    }
+}
+
+#[test]
+fn noise_is_the_smallest_of_four_pairs() {
+    // Stripes that nothing cancels: the pair feigns noise.
+    let wild: Make = |_, seed| [shot(seed, |x| x % 6 < 3), shot(seed + 1, |x| x % 10 < 5)];
+    let mut judge = judge(Mode::Paper, None);
+    let ratio = |judge: &PairSumJudge| judge.noise.unwrap().variance(600.0) / NOISE.variance(600.0);
+    verdicts(&mut judge, &[(0, wild), (1, good)]);
+    assert!(ratio(&judge) > 100.0, "{}", ratio(&judge));
+    verdicts(&mut judge, &[(2, good)]);
+    assert!((0.7..1.3).contains(&ratio(&judge)), "{}", ratio(&judge));
+    verdicts(&mut judge, &[(3, good), (4, good)]);
+    let settled = judge.noise;
+    assert!(judge.noise_settled() && judge.last_pair.is_none());
+    verdicts(&mut judge, &[(5, good), (6, wild)]);
+    assert_eq!(judge.noise, settled);
+}
