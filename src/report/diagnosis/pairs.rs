@@ -4,6 +4,9 @@
 //! - on flat areas: frame and reference do not belong together (stale, torn, motion, flicker, drift, unsettled), or
 //! - at stripe edges only, where alone P and Q take values that the references do not: the response is not linear.
 
+mod disturbed;
+mod light;
+
 use polscan_patterns::Axis;
 use serde_json::{Value, json};
 
@@ -35,29 +38,12 @@ const FINE_RANKS: u8 = 3;
 const LONE_OUTLIERS: f64 = 0.2;
 /// Outliers of a fine pair that is sound beside it.
 const SOUND_OUTLIERS: f64 = 0.05;
-/// Residual as a share of the modulation from which on a frame shows another picture (1 is the ideal), not a rest of it.
-const STALE_SHARE: f64 = 0.5;
-/// Outliers of a pair from which on a whole frame is wrong. A frame that shows another pattern is wrong on a half of
-/// the pixels or more.
-const WHOLE_FRAME: f64 = 0.15;
-/// Share of the coarse pairs up to which a disturbance came and went.
-const FEW_PAIRS: f64 = 0.15;
-/// How far the bad pixels of one pair are those of the next as well, 0 by chance and 1 for all, from which on something
-/// moved. Where frames show other patterns it is chance.
-const SAME_PIXELS: f64 = 0.4;
 /// Shift and spread of a pair that call for a closer look, in units of noise that was measured: where it was estimated,
 /// from 8-bit frames in particular, sound pairs reach them.
 const LOOK_SHIFT: f64 = 0.5;
 const LOOK_SIGMA: f64 = 1.25;
 /// Change of the light of single frames that is a reason, by the same measure as `DRIFT`.
 const CHANGE: f64 = 0.02;
-/// Correlation of the shifts with the order of the pairs from which on they are a drift rather than a flicker.
-const TREND: f64 = 0.8;
-/// Difference of first and last references, as a share of the modulation, from which on it is a reason: it moves a stripe
-/// edge by about a third of the 0.05 px that an edge should be good for.
-const DRIFT: f64 = 0.02;
-/// Share of the drift that the modulation must take part in for lamp or exposure to be its cause.
-const LAMP_SHARE: f64 = 0.5;
 
 /// A pair with what the rules ask of it.
 #[derive(Clone, Copy)]
@@ -171,9 +157,9 @@ pub fn diagnose(decoded: &Decoded, frames: Option<Frames>) -> Vec<Reason> {
     let Sorted { sound, shifted, disturbed } = sort(&coarse, frames, !decoded.noise_estimated);
 
     let mut reasons = Vec::new();
-    reasons.extend(brightness(decoded, frames, &coarse, &shifted));
+    reasons.extend(light::brightness(decoded, frames, &coarse, &shifted));
     if !disturbed.is_empty() {
-        reasons.push(disturbance(&disturbed, coarse.len()));
+        reasons.push(disturbed::disturbance(&disturbed, coarse.len()));
         // With pairs disturbed, what happens at edges and in fine stripes is no evidence of its own; nor where pairs are
         // compared with each other for want of references.
         let compared = frames.is_some_and(|frames| !frames.has_references());
@@ -184,7 +170,7 @@ pub fn diagnose(decoded: &Decoded, frames: Option<Frames>) -> Vec<Reason> {
     match lone(&fine) {
         Some(view) if disturbed.is_empty() => {
             let look = frames.and_then(|frames| frames.look(view.pair.axis, view.pair.bit, false));
-            reasons.push(fine_frame(&Case { view, look }));
+            reasons.push(disturbed::fine_frame(&Case { view, look }));
         }
         Some(_) => {}
         None => {
@@ -236,201 +222,6 @@ fn worst<'a>(views: &[View<'a>], by: impl Fn(&View) -> f64) -> Option<View<'a>> 
 
 fn all_evidence(cases: &[Case]) -> Value {
     json!({ "pairs": cases.iter().map(Case::evidence).collect::<Vec<_>>() })
-}
-
-/// Light that changed.
-fn brightness(
-    decoded: &Decoded,
-    frames: Option<Frames>,
-    coarse: &[View],
-    shifted: &[Case],
-) -> Option<Reason> {
-    let trend = trend(coarse);
-    let drift = decoded.drift.and_then(statistics::finite);
-    let drifted = drift.is_some_and(|drift| drift.abs() > DRIFT);
-    if drifted || (!shifted.is_empty() && trend.abs() >= TREND) {
-        let modulation = frames.and_then(|frames| frames.modulation_drift());
-        return Some(drift_reason(drift, modulation, trend, shifted));
-    }
-    if shifted.is_empty() {
-        return None;
-    }
-    let change = |case: &Case| case.look.as_ref().map(|look| look.change.abs());
-    let by = match shifted.iter().filter_map(change).max_by(f64::total_cmp) {
-        Some(change) => format!("{:.1} %", 100.0 * change),
-        None => {
-            let shifts = shifted.iter().map(|case| case.view.shift.abs());
-            format!("{:.1} times the noise", shifts.fold(0.0, f64::max))
-        }
-    };
-    let mut evidence = all_evidence(shifted);
-    evidence["trend"] = json!(trend);
-    Some(Reason::degraded(
-        Diagnosis::Flicker,
-        format!(
-            "the light of {} differs from that of the other frames by up to {by}, to and fro rather than steadily; the \
-             lamp or the room's light flickers faster than a scan takes: choose an exposure of whole periods of the mains \
-             (10 or 20 ms at 50 Hz) or of the projector's refresh, and shade the scene",
-            names(shifted),
-        ),
-        evidence,
-    ))
-}
-
-fn drift_reason(drift: Option<f64>, modulation: Option<f64>, trend: f64, shifted: &[Case]) -> Reason {
-    let seen = match drift {
-        Some(drift) => {
-            format!("the last references differ from the first by {:+.1} % of the modulation", 100.0 * drift)
-        }
-        None => format!("the light changed steadily over {}", names(shifted)),
-    };
-    let mut evidence = all_evidence(shifted);
-    evidence["drift"] = json!(drift);
-    evidence["modulation_drift"] = json!(modulation);
-    evidence["trend"] = json!(trend);
-    let lamp = drift.zip(modulation).map(|(drift, modulation)| modulation.abs() >= LAMP_SHARE * drift.abs());
-    if lamp == Some(false) {
-        return Reason::degraded(
-            Diagnosis::AmbientDrift,
-            format!(
-                "{seen}, while the projector's own light stayed the same; daylight or a lamp in the room changed: shade \
-                 the scene or switch the room's light off, and scan again"
-            ),
-            evidence,
-        );
-    }
-    let cause = match lamp {
-        Some(_) => "the projector's lamp warms up or the camera adjusts itself",
-        None => "the projector's lamp warms up, the camera adjusts itself, or the light in the room changed",
-    };
-    Reason::degraded(
-        Diagnosis::ExposureDrift,
-        format!(
-            "{seen}; {cause}: let the lamp warm up for 20 minutes, switch automatic exposure, gain and the projector's \
-             eco mode off, and scan again"
-        ),
-        evidence,
-    )
-}
-
-/// Correlation of the shifts with the order in which the pairs were captured; 0 for fewer than four.
-fn trend(coarse: &[View]) -> f64 {
-    if coarse.len() < 4 {
-        return 0.0;
-    }
-    let middle = (coarse.len() - 1) as f64 / 2.0;
-    let mean = coarse.iter().map(|view| view.shift).sum::<f64>() / coarse.len() as f64;
-    let (mut cross, mut places, mut shifts) = (0.0, 0.0, 0.0);
-    for (place, view) in coarse.iter().enumerate() {
-        let (place, shift) = (place as f64 - middle, view.shift - mean);
-        cross += place * shift;
-        places += place * place;
-        shifts += shift * shift;
-    }
-    statistics::finite(cross / (places * shifts).sqrt()).unwrap_or(0.0)
-}
-
-/// Pixels that do not fit together on flat areas.
-fn disturbance(disturbed: &[Case], coarse: usize) -> Reason {
-    if disturbed.len() as f64 <= (FEW_PAIRS * coarse as f64).max(2.0) {
-        return one_frame(disturbed);
-    }
-    let share = disturbed.iter().map(Case::share).fold(0.0, f64::max);
-    let looks: Vec<&Look> = disturbed.iter().filter_map(|case| case.look.as_ref()).collect();
-    let mut same: Vec<f64> = looks.windows(2).filter_map(|pair| pair[0].same_pixels(pair[1])).collect();
-    let same = statistics::median(&mut same);
-    let mut strengths: Vec<f64> = disturbed.iter().filter_map(Case::strength).collect();
-    let strength = statistics::median(&mut strengths);
-    let mut evidence = all_evidence(disturbed);
-    evidence["same_pixels"] = json!(same);
-    let moved = same.map_or(share < WHOLE_FRAME, |same| same >= SAME_PIXELS);
-    match strength {
-        _ if moved => motion(disturbed, share, evidence),
-        Some(rest) if rest < STALE_SHARE => Reason::degraded(
-            Diagnosis::UnsettledDisplay,
-            format!(
-                "in {} the frames do not add up to the references: a rest of about {:.0} % of the picture before is \
-                 still on the glass; the display had not settled: run `polscan calibrate sync`, or hold each picture \
-                 for one refresh more",
-                names(disturbed),
-                100.0 * rest,
-            ),
-            evidence,
-        ),
-        _ => Reason::failed(
-            Diagnosis::StaleFrame,
-            format!(
-                "in {} up to {:.0} % of the flat pixels do not add up to the references; the frames show other \
-                 pictures than they should, as when each is captured one picture too early: run \
-                 `polscan calibrate sync`, and scan again",
-                names(disturbed),
-                100.0 * share,
-            ),
-            evidence,
-        ),
-    }
-}
-
-/// A disturbance of one pair or two.
-fn one_frame(disturbed: &[Case]) -> Reason {
-    let share = disturbed.iter().map(Case::share).fold(0.0, f64::max);
-    let worst = disturbed.iter().max_by(|a, b| a.share().total_cmp(&b.share()));
-    let by_modulation = worst.and_then(Case::strength).is_none_or(|strength| strength >= STALE_SHARE);
-    if let Some(row) = worst.and_then(|case| case.look.as_ref()?.torn_at).filter(|_| by_modulation) {
-        return torn(disturbed, row);
-    }
-    match share >= WHOLE_FRAME && by_modulation {
-        true => stale(disturbed, share),
-        false => motion(disturbed, share, all_evidence(disturbed)),
-    }
-}
-
-/// A disturbance of a fine pair alone: blur takes its residual's strength, and motion would not spare the others.
-fn fine_frame(case: &Case) -> Reason {
-    match case.look.as_ref().and_then(|look| look.torn_at) {
-        Some(row) => torn(std::slice::from_ref(case), row),
-        None => stale(std::slice::from_ref(case), case.view.outliers()),
-    }
-}
-
-fn torn(disturbed: &[Case], row: usize) -> Reason {
-    Reason::failed(
-        Diagnosis::TornFrame,
-        format!(
-            "in {} the image is sound on one side of row {row} and wrong on the other; the frame was exposed while the \
-             picture changed: switch vertical sync on, run `polscan calibrate sync`, and scan again",
-            names(disturbed),
-        ),
-        all_evidence(disturbed),
-    )
-}
-
-fn stale(disturbed: &[Case], share: f64) -> Reason {
-    Reason::failed(
-        Diagnosis::StaleFrame,
-        format!(
-            "in {} {:.0} % of the pixels do not add up to the references, by as much as another picture would make; one \
-             of its frames shows the picture before: run `polscan calibrate sync`, or raise the delay from flip to \
-             trigger, and scan again",
-            names(disturbed),
-            100.0 * share,
-        ),
-        all_evidence(disturbed),
-    )
-}
-
-fn motion(disturbed: &[Case], share: f64, evidence: Value) -> Reason {
-    let message = format!(
-        "in {} up to {:.1} % of the flat pixels do not add up to the references, in a part of the image; something \
-         moved there during the capture: hold object, camera and projector still, and scan again",
-        names(disturbed),
-        100.0 * share,
-    );
-    // Where most of the image moved, no part of it can be trusted.
-    match share > 0.5 {
-        true => Reason::failed(Diagnosis::Motion, message, evidence),
-        false => Reason::degraded(Diagnosis::Motion, message, evidence),
-    }
 }
 
 /// A fine pair that is bad while all other fine ones are sound: no matter of the response, which spoils all of them.
