@@ -224,7 +224,7 @@ fn a_process_that_dies_before_the_last_rename_leaves_a_stale_folder() {
     write();
     fs::rename(&out, &partial).unwrap();
     fs::write(partial.join(".polscan-partial"), "").unwrap();
-    assert_eq!(remove_stale_partials(folder.path()).unwrap(), [partial.clone()]);
+    assert_eq!(remove_stale_partials(folder.path()).unwrap(), std::slice::from_ref(&partial));
     assert!(names(folder.path()).is_empty());
     // A bundle that somebody named so has no marker, and is never removed.
     write();
