@@ -6,8 +6,9 @@ use clap::{Args, Parser, Subcommand};
 use polscan_patterns::Mode;
 
 use crate::{
-    commands::{self, Failure},
+    commands,
     config::{Layers, Override},
+    engine::Failure,
     report::NamedRegion,
 };
 
@@ -71,9 +72,12 @@ struct Decode {
     /// Calibration to use instead of the bundle's own.
     #[arg(long, value_name = "FILE")]
     calibration: Option<PathBuf>,
-    /// Bouguet stereo results only: the projector is the left device, the camera the right one.
+    /// The calibration is another tool's stereo result whose left (first) device is the projector.
     #[arg(long)]
     projector_left: bool,
+    /// Millimetres per unit of length in another tool's calibration: 1000 for metres.
+    #[arg(long, value_name = "MM", default_value_t = 1.0)]
+    calibration_unit_mm: f64,
     /// Decode in another mode than the one recorded.
     #[arg(long)]
     mode: Option<Mode>,
@@ -118,9 +122,13 @@ pub fn run() -> u8 {
         Ok(cli) => cli,
         Err(error) => {
             // Help and version are no errors; clap prints each to its own stream.
-            let code = if error.use_stderr() { commands::USAGE } else { 0 };
-            let _ = error.print();
-            return code;
+            if !error.use_stderr() {
+                let _ = error.print();
+                return 0;
+            }
+            let json = std::env::args_os().any(|argument| argument == "--json");
+            commands::print_usage(&error.render().to_string(), json);
+            return commands::USAGE;
         }
     };
     start_logging();
@@ -128,7 +136,7 @@ pub fn run() -> u8 {
         Ok(code) => code,
         Err(failure) => {
             commands::print_failure(&failure, cli.json);
-            failure.code()
+            commands::exit_code(&failure)
         }
     }
 }
@@ -154,6 +162,7 @@ fn dispatch(cli: &Cli) -> Result<u8, Failure> {
             bundle: &args.bundle,
             calibration: args.calibration.as_deref(),
             projector_left: args.projector_left,
+            calibration_unit_mm: args.calibration_unit_mm,
             mode: args.mode,
             regions: &args.region,
             out: &args.out,

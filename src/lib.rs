@@ -7,6 +7,7 @@ pub mod cloud;
 pub mod commands;
 pub mod config;
 pub mod decode;
+pub mod engine;
 pub mod geometry;
 pub mod grid;
 pub mod pipeline;

@@ -4,15 +4,13 @@ use std::{path::Path, time::Instant};
 
 use polscan_patterns::{Mode, ProjectorSize, Role, Sequence};
 
-use super::{
-    Failure,
-    results::{self, Results},
-};
+use super::print_result;
 use crate::{
     cloud::ReconstructSettings,
+    engine::{self, Failure, Results},
     geometry::{Calibration, ReadHints},
     pipeline::{self, Context, Job, PipelineError},
-    report::{CaptureSummary, NamedRegion, Reason, Timings, Verdict},
+    report::{CaptureSummary, NamedRegion, Reason, Timings, check_regions},
     store::{
         Bundle, BundleWriter, FrameSet, Limits, Manifest, Policy,
         manifest::{Capture, Processing, Volume},
@@ -31,6 +29,8 @@ pub struct DecodeArgs<'a> {
     pub calibration: Option<&'a Path>,
     /// Whether the first device of a stereo result is the projector.
     pub projector_left: bool,
+    /// Millimetres per unit of length of another tool's calibration.
+    pub calibration_unit_mm: f64,
     /// Mode that comes before the bundle's own.
     pub mode: Option<Mode>,
     /// Regions to measure; those of the bundle where there are none.
@@ -59,9 +59,7 @@ pub fn decode(args: &DecodeArgs) -> Result<u8, Failure> {
     let manifest = bundle.manifest();
     let processing = manifest.processing.clone().unwrap_or_default();
     let regions = if args.regions.is_empty() { processing.regions.clone() } else { args.regions.to_vec() };
-    for region in &regions {
-        region.check(frames.width, frames.height).map_err(|e| Failure::data(operation(), e))?;
-    }
+    check_regions(&regions, (frames.width, frames.height)).map_err(|e| Failure::data(operation(), e))?;
     let volume = processing.volume.unwrap_or(UNBOUNDED);
     let job = Job {
         roles: &sequence.roles,
@@ -96,7 +94,7 @@ pub fn decode(args: &DecodeArgs) -> Result<u8, Failure> {
         frames: None,
     };
     let mut result = Manifest::new(&sequence, bundle.absolute_frames());
-    result.id = Some(results::new_id());
+    result.id = Some(engine::new_id());
     result.label = manifest.label.clone();
     result.tags = manifest.tags.clone();
     result.rig = manifest.rig.clone();
@@ -107,9 +105,8 @@ pub fn decode(args: &DecodeArgs) -> Result<u8, Failure> {
     result.capture = manifest.capture.clone();
     result.source = Some(bundle.origin(&frames));
     result.processing = Some(Processing { regions: regions.clone(), ..processing });
-    let report = results::write(writer, result, &results)?;
-    results::print(&report, args.out, args.json);
-    Ok(if report.verdict == Verdict::Failed { super::failure::FAILED } else { 0 })
+    let report = engine::write(writer, result, &results)?;
+    Ok(print_result(&report, args.out, args.json))
 }
 
 /// What the sequencer found when the frames were captured.
@@ -147,6 +144,7 @@ fn resolve(
     let mut hints = ReadHints {
         camera_size: Some((frames.width as u32, frames.height as u32)),
         swap: args.projector_left,
+        unit_mm: args.calibration_unit_mm,
         ..ReadHints::default()
     };
     hints.projector_size = manifest.projector.map(|size| (size.width, size.height));

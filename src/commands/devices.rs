@@ -2,12 +2,15 @@
 
 use std::path::Path;
 
-use super::Failure;
-use crate::{app, config::Settings};
+use crate::{
+    app,
+    config::Settings,
+    engine::{Failure, rig_failure},
+};
 
 /// Lists what the configured drivers find.
 pub fn devices(settings: &Settings, json: bool) -> Result<u8, Failure> {
-    let (cameras, projectors) = app::list(settings).map_err(super::scan::rig_failure)?;
+    let (cameras, projectors) = app::list(settings).map_err(rig_failure)?;
     if json {
         super::say(serde_json::json!({ "cameras": cameras, "projectors": projectors }));
         return Ok(0);

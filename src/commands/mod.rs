@@ -4,20 +4,33 @@ mod decode;
 mod devices;
 mod failure;
 mod patterns;
-mod pictures;
 mod progress;
-mod results;
 mod scan;
 
-use std::io::Write;
+use std::{io::Write, path::Path};
+
+use crate::report::{self, Outputs, Report, Verdict};
 
 pub use decode::{DecodeArgs, decode};
 pub use devices::{config_is_good, devices};
-pub use failure::{Failure, USAGE, print_failure};
+pub use failure::{USAGE, exit_code, print_failure, print_usage};
 pub use patterns::{Size, patterns};
 pub use scan::scan;
 
 /// Prints a line to stdout. A reader that has gone away is no error of ours.
 fn say(text: impl std::fmt::Display) {
     let _ = writeln!(std::io::stdout().lock(), "{text}");
+}
+
+/// Prints the report of a result for a person, or as JSON for a script; returns the exit code.
+fn print_result(report: &Report, out: &Path, json: bool) -> u8 {
+    if json {
+        say(serde_json::json!({ "out": out, "verdict": report.verdict, "report": report }));
+    } else {
+        let named =
+            ["cloud.ply", "cloud.png", "overview.png", "report.json", "maps.npz", "maps/", "frames.npy"];
+        let files: Vec<&str> = named.into_iter().filter(|name| out.join(name).exists()).collect();
+        say(report::summary(report, Some(Outputs { directory: out, files: &files })).trim_end());
+    }
+    if report.verdict == Verdict::Failed { failure::FAILED } else { 0 }
 }

@@ -4,9 +4,9 @@ use std::{path::Path, str::FromStr};
 
 use polscan_patterns::{Mode, ProjectorSize, Sequence};
 
-use super::Failure;
 use crate::{
     config::Settings,
+    engine::Failure,
     store::{BundleWriter, Manifest, error::StorageError, manifest::FrameFiles},
 };
 

@@ -63,6 +63,10 @@ pub struct Rig {
     pub name: String,
     /// Path, relative to the configuration file.
     pub calibration: String,
+    /// Stereo results of other tools: whether the first (left) device is the projector.
+    pub calibration_projector_left: bool,
+    /// Millimetres per unit of length in the calibrations of other tools.
+    pub calibration_unit_mm: f64,
 }
 
 /// `[volume]`

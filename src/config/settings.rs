@@ -12,10 +12,14 @@ use super::raw::{self, DeviceDriver, Raw};
 use crate::decode::Thresholds;
 
 /// Where the calibration of the rig comes from.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct RigCalibration {
     /// File, resolved against the folder of the configuration.
     pub path: PathBuf,
+    /// Whether the first (left) device of a stereo result is the projector.
+    pub projector_left: bool,
+    /// Millimetres per unit of length of the file.
+    pub unit_mm: f64,
 }
 
 /// Typed settings that passed every check.
@@ -47,7 +51,7 @@ impl Settings {
         let polarization = polarization(&raw.projector, faults);
         let region = region(&raw.camera.region, faults);
         let sim = sim(&raw, folder, faults);
-        let calibration = calibration(&raw.rig.calibration, folder, faults);
+        let calibration = calibration(&raw.rig, folder, faults);
         if !faults.is_empty() {
             return None;
         }
@@ -86,6 +90,7 @@ fn check_ranges(raw: &Raw, faults: &mut Faults) {
     within("camera.gamma", raw.camera.gamma, 0.1, 5.0, "");
     within("projector.hold_refreshes", f64::from(raw.projector.hold_refreshes), 0.0, 600.0, " refreshes");
     within("projector.trigger_delay_ms", raw.projector.trigger_delay_ms, 0.0, 10_000.0, " ms");
+    within("rig.calibration_unit_mm", raw.rig.calibration_unit_mm, 1e-3, 1e6, " mm");
     within("capture.retakes_per_pair", f64::from(raw.capture.retakes_per_pair), 0.0, 100.0, "");
     within("capture.retakes_per_scan", f64::from(raw.capture.retakes_per_scan), 0.0, 1000.0, "");
     within("decode.lit_sigma", raw.decode.lit_sigma, 1.0, 100.0, " sigma");
@@ -160,17 +165,21 @@ fn region(raw: &raw::RegionTable, faults: &mut Faults) -> Option<Region> {
     }
 }
 
-fn calibration(text: &str, folder: &Path, faults: &mut Faults) -> Option<RigCalibration> {
-    if text.is_empty() {
+fn calibration(rig: &raw::Rig, folder: &Path, faults: &mut Faults) -> Option<RigCalibration> {
+    if rig.calibration.is_empty() {
         return None;
     }
-    let path = folder.join(text);
+    let path = folder.join(&rig.calibration);
     if !path.is_file() {
         let message =
             format!("no file at {}; the path is relative to the configuration file", path.display());
         faults.push(("rig.calibration".into(), message));
     }
-    Some(RigCalibration { path })
+    Some(RigCalibration {
+        path,
+        projector_left: rig.calibration_projector_left,
+        unit_mm: rig.calibration_unit_mm,
+    })
 }
 
 /// A fault of the rig's description, which begins with its key path.

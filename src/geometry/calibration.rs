@@ -123,6 +123,11 @@ impl Calibration {
         faults
     }
 
+    /// The calibration for frames that are a region of the camera's image: `size` (width, height) from pixel `origin` on.
+    pub fn cropped(&self, origin: (u32, u32), size: (u32, u32)) -> Self {
+        Self { camera: self.camera.cropped(origin, size), ..self.clone() }
+    }
+
     /// Whether the calibration is of these image sizes, each (width, height). Every disagreement is named.
     ///
     /// # Errors

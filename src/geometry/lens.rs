@@ -27,8 +27,9 @@ const MAX_SIDE: u32 = 32_768;
 const MAX_FOCAL_SIDES: f64 = 100.0;
 /// A shorter lens would see more than 157 degrees, where the pinhole model has no meaning.
 const MIN_FOCAL_SIDES: f64 = 0.1;
-/// Lens shift of projectors and cropped regions put the principal point outside the image, but not by more.
-const PRINCIPAL_MARGIN: f64 = 0.5;
+/// Lens shift puts the principal point outside the image, and so does a small region in a corner of a sensor; a point
+/// farther off than this many sides is a diverged number.
+const PRINCIPAL_MARGIN: f64 = 10.0;
 /// Pixels of diamond micro-mirrors have 1:2; anything far beyond is a swapped or diverged number.
 const MAX_ASPECT: f64 = 2.5;
 /// Newton steps of the inverse; a monotone lens needs fewer than ten.
@@ -37,6 +38,18 @@ const MAX_STEPS: usize = 50;
 const STEP_TOLERANCE: f64 = 1e-12;
 
 impl Lens {
+    /// The same lens before a part of its image: the region of `size` (width, height) that begins at pixel `origin`.
+    /// Brown's distortion is a matter of angles, so that it stays as it is.
+    pub fn cropped(&self, origin: (u32, u32), size: (u32, u32)) -> Self {
+        Self {
+            width: size.0,
+            height: size.1,
+            cx: self.cx - f64::from(origin.0),
+            cy: self.cy - f64::from(origin.1),
+            ..*self
+        }
+    }
+
     /// (width, height) in pixels.
     pub fn size(&self) -> (u32, u32) {
         (self.width, self.height)

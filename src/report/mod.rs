@@ -17,7 +17,7 @@ pub use accuracy::Accuracy;
 pub use build::{ReportInput, build};
 pub use capture::CaptureSummary;
 pub use diagnosis::{Diagnosis, Reason, Verdict, verdict};
-pub use region::{NamedRegion, RegionError};
+pub use region::{NamedRegion, RegionError, check_regions};
 pub use summary::{Outputs, summary};
 pub use types::{
     BorderReport, CalibrationReport, CaptureReport, Contrast, NoiseReport, PairName, PairReport,

@@ -61,6 +61,12 @@ pub enum RegionError {
         /// Rows of the image.
         height: usize,
     },
+    /// Two regions that nobody could tell apart.
+    #[error("two regions are named `{name}`; give each a name of its own")]
+    Repeated {
+        /// Name.
+        name: String,
+    },
 }
 
 impl FromStr for NamedRegion {
@@ -83,9 +89,20 @@ impl FromStr for NamedRegion {
     }
 }
 
+/// Refuses regions that reach beyond an image of `size` (width, height), or share a name.
+pub fn check_regions(regions: &[NamedRegion], (width, height): (usize, usize)) -> Result<(), RegionError> {
+    for (number, region) in regions.iter().enumerate() {
+        region.check(width, height)?;
+        if regions[..number].iter().any(|other| other.name == region.name) {
+            return Err(RegionError::Repeated { name: region.name.clone() });
+        }
+    }
+    Ok(())
+}
+
 impl NamedRegion {
     /// Refuses a region that reaches beyond an image of `width` x `height`.
-    pub fn check(&self, width: usize, height: usize) -> Result<(), RegionError> {
+    fn check(&self, width: usize, height: usize) -> Result<(), RegionError> {
         let fits = |start: usize, size: usize, all| start.checked_add(size).is_some_and(|end| end <= all);
         if fits(self.x, self.width, width) && fits(self.y, self.height, height) {
             return Ok(());
@@ -200,6 +217,9 @@ mod tests {
         assert!(matches!("a=0,0,4,9".parse::<NamedRegion>(), Err(RegionError::Small { .. })));
         assert_eq!(region.check(40, 60), Ok(()));
         assert!(region.check(39, 60).is_err() && region.check(40, 59).is_err());
-        assert!(NamedRegion { x: usize::MAX, ..region }.check(40, 60).is_err());
+        assert!(NamedRegion { x: usize::MAX, ..region.clone() }.check(40, 60).is_err());
+        let twice = [region.clone(), NamedRegion { x: 0, ..region }];
+        assert_eq!(check_regions(&twice[..1], (40, 60)), Ok(()));
+        assert_eq!(check_regions(&twice, (40, 60)), Err(RegionError::Repeated { name: "plate".into() }));
     }
 }

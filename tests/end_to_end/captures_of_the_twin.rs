@@ -114,6 +114,22 @@ fn the_manifest_holds_the_evidence_of_every_frame() {
 }
 
 #[test]
+fn a_calibration_of_the_whole_sensor_serves_a_region_of_it() {
+    let region = [("x", 120), ("y", 40), ("width", 200), ("height", 160)];
+    let region: toml::Table =
+        region.map(|(key, value)| (key.to_string(), toml::Value::from(value))).into_iter().collect();
+    let rig = Rig::small().set("camera.region", region);
+    rig.scan("scan", &[]).expect(0);
+    check_against_truth(&rig, "scan");
+    let report = rig.report("scan");
+    assert_eq!(report["size"], serde_json::json!({ "width": 200, "height": 160 }));
+    let rmse = report["truth"]["depth_rmse_mm"].as_f64().expect("depth is compared with the truth");
+    assert!(rmse < 1.0, "{}", report["truth"]);
+    rig.decode("scan", "again", &[]).expect(0);
+    assert!(rig.bytes("scan", "cloud.ply") == rig.bytes("again", "cloud.ply"));
+}
+
+#[test]
 fn without_a_calibration_there_are_columns_but_no_cloud() {
     let rig = Rig::small().set("rig.calibration", "");
     rig.scan("scan", &["--mode", "fast"]).expect(0);

@@ -90,6 +90,11 @@ fn parse(bytes: &[u8], name: &str, hints: &ReadHints) -> Result<Calibration, Vec
             .map_err(|error| one(format!("it is not UTF-8 text from byte {} on", error.valid_up_to())))
     };
     match format {
+        Format::Toml if hints.swap || hints.unit_mm != 1.0 => Err(one(
+            "it names its camera and its projector and is in millimetres; exchanged devices and another unit are for \
+             the files of other tools"
+                .into(),
+        )),
         Format::Toml => canonical::read(text()?),
         Format::OpencvYaml => storage::interpret(&yaml::read(text()?).map_err(one)?, hints),
         Format::OpencvXml => storage::interpret(&xml::read(text()?).map_err(one)?, hints),

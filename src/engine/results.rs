@@ -1,6 +1,6 @@
 //! What scan and decode write alike: maps, pictures, cloud, calibration, report.
 
-use std::{path::Path, time::Instant};
+use std::time::Instant;
 
 use super::{Failure, pictures};
 use crate::{
@@ -8,7 +8,7 @@ use crate::{
     decode::{DecodeSettings, SharedPlane},
     geometry::Calibration,
     pipeline::{self, Context, Job, Outcome},
-    report::{self, Outputs, Report, Timings},
+    report::{Report, Timings},
     store::{BundleWriter, Manifest, bundle, error::StorageError, maps::Maps},
 };
 
@@ -117,17 +117,6 @@ fn write_cloud(writer: &BundleWriter, results: &Results) -> Result<(), StorageEr
         }
         .map(|_| ())
     })
-}
-
-/// Prints the report for a person, or as JSON for a script.
-pub fn print(report: &Report, out: &Path, json: bool) {
-    if json {
-        super::say(serde_json::json!({ "out": out, "verdict": report.verdict, "report": report }));
-        return;
-    }
-    let named = ["cloud.ply", "cloud.png", "overview.png", "report.json", "maps.npz", "maps/", "frames.npy"];
-    let files: Vec<&str> = named.into_iter().filter(|name| out.join(name).exists()).collect();
-    super::say(report::summary(report, Some(Outputs { directory: out, files: &files })).trim_end());
 }
 
 /// Time in milliseconds and the process: unique on a machine, and sorted by time.

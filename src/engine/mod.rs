@@ -1,0 +1,12 @@
+//! One scan, from settings to a bundle, without a user interface: the command line and the service both come through
+//! here. [`Scan::prepare`] needs the rig for a moment, [`Scan::capture`] for as long as frames are taken, and
+//! [`Scan::finish`] not at all, so that the next scan may be captured while one is decoded.
+
+mod failure;
+mod pictures;
+mod results;
+mod scan;
+
+pub use failure::{Failure, Kind};
+pub use results::{Results, new_id, write, write_unfinished};
+pub use scan::{Label, Scan, Taken, rig_failure};

@@ -1,0 +1,372 @@
+//! The stages of a scan.
+
+use std::time::Duration;
+
+use polscan_drivers::{
+    camera::{AppliedSettings, CameraInfo},
+    projector::ProjectorInfo,
+};
+use polscan_patterns::{ProjectorSize, Sequence};
+
+use super::{
+    Failure,
+    results::{self, Results},
+};
+use crate::{
+    app::{Rig, RigError},
+    cloud::ReconstructSettings,
+    config::Settings,
+    decode::{Accumulator, CameraResponse, DecodeSettings, NoiseModel, SharedPlane},
+    geometry::{Calibration, ReadHints},
+    pipeline::{self, Context, Job},
+    report::{
+        self, CaptureSummary, Diagnosis, NamedRegion, Reason, Report, ReportInput, Size, check_regions,
+    },
+    sequencer::{
+        CancelFlag, CaptureFailure, CaptureRecord, PartialCapture, Plan, PlanError, PlanOptions, Progress,
+        capture,
+    },
+    store::{
+        BundleWriter, Manifest,
+        bundle::FRAMES_FILE_NAME,
+        manifest::{self, FrameFiles, Processing, Volume},
+        source::read_calibration,
+    },
+    truth::Truth,
+    verify::{PairSumJudge, shared_plane},
+};
+
+/// Bytes of maps, cloud and pictures per camera pixel, generously: five float maps, a cloud of 30 bytes a point, truth.
+const RESULT_BYTES_PER_PIXEL: u64 = 90;
+
+/// A scan that can begin: the camera has its settings, and everything that can be refused has been checked.
+#[derive(Debug)]
+pub struct Scan {
+    plan: Plan,
+    decode: DecodeSettings,
+    calibration: Option<Calibration>,
+    reconstruct: ReconstructSettings,
+    regions: Vec<NamedRegion>,
+    rig: manifest::Rig,
+    settings: Settings,
+    simulated: bool,
+}
+
+/// What a capture left in memory, complete or not. The object may move from here on.
+#[derive(Debug)]
+pub struct Taken {
+    record: CaptureRecord,
+    /// Why the capture did not come to its end.
+    failure: Option<Reason>,
+    truth: Option<Truth>,
+}
+
+/// How a scan is called.
+#[derive(Debug, Clone, Default)]
+pub struct Label {
+    /// Unique identifier.
+    pub id: String,
+    /// Name for a person.
+    pub label: Option<String>,
+    /// For sorting and searching.
+    pub tags: Vec<String>,
+}
+
+impl Taken {
+    /// Why the capture did not come to its end; its frames are kept all the same.
+    pub fn failure(&self) -> Option<&Reason> {
+        self.failure.as_ref()
+    }
+
+    /// How the capture went.
+    pub fn record(&self) -> &CaptureRecord {
+        &self.record
+    }
+}
+
+impl Scan {
+    /// Applies the settings to the camera and checks all that can be checked before the first picture.
+    pub fn prepare(settings: &Settings, regions: &[NamedRegion], rig: &mut Rig) -> Result<Self, Failure> {
+        let device = |source| Failure::Device { operation: "apply the camera settings", source };
+        let applied = rig.camera.apply(&settings.camera).map_err(device)?;
+        let (camera, projector) = (rig.camera.info().clone(), rig.projector.info().clone());
+        let size = ProjectorSize { width: projector.width, height: projector.height };
+        let sequence =
+            Sequence::new(settings.mode, size).map_err(|e| Failure::data("make the patterns", e))?;
+        let calibration = calibration(settings, &applied, &camera, size)?;
+        let (width, height) = (applied.width as usize, applied.height as usize);
+        check_regions(regions, (width, height)).map_err(|e| Failure::data("measure a region", e))?;
+        let decode = DecodeSettings {
+            mode: settings.mode,
+            column: sequence.column,
+            row: sequence.row,
+            width,
+            height,
+            camera: response(&applied),
+            thresholds: settings.thresholds,
+        };
+        let plan = plan(settings, sequence, &projector, applied)?;
+        // What no frames can be decoded with is refused before any is captured.
+        Accumulator::new(decode.clone()).map_err(|error| setup("decode with these settings", error))?;
+        let rig = manifest::Rig {
+            name: settings.raw.rig.name.clone(),
+            camera,
+            projector,
+            polarization: settings.polarization,
+            calibration_id: calibration.as_ref().map(Calibration::id),
+        };
+        Ok(Self {
+            plan,
+            decode,
+            calibration,
+            reconstruct: ReconstructSettings {
+                near_mm: settings.raw.volume.near_mm,
+                far_mm: settings.raw.volume.far_mm,
+                row_gate_px: settings.raw.decode.row_gate_px,
+            },
+            regions: regions.to_vec(),
+            rig,
+            settings: settings.clone(),
+            simulated: settings.sim.is_some(),
+        })
+    }
+
+    /// Number of frames that the capture takes.
+    pub fn frames(&self) -> usize {
+        self.plan.sequence.roles.len()
+    }
+
+    /// Bytes that the result may need on the disk, generously.
+    pub fn bytes(&self) -> u64 {
+        let pixels = self.decode.width as u64 * self.decode.height as u64;
+        let sample_bytes = if self.decode.camera.bit_depth > 8 { 2 } else { 1 };
+        pixels * (self.frames() as u64 * sample_bytes + RESULT_BYTES_PER_PIXEL)
+    }
+
+    /// Captures all frames. Blocks until the last one has come, or something stands in the way, or `cancel` asks to stop;
+    /// the projector is black afterwards.
+    pub fn capture(
+        &self,
+        rig: &mut Rig,
+        progress: &mut dyn FnMut(Progress<'_>),
+        cancel: &CancelFlag,
+    ) -> Taken {
+        let DecodeSettings { camera, thresholds, .. } = self.decode;
+        let mut judge = PairSumJudge::new(self.plan.sequence.clone(), camera, thresholds);
+        let Rig { projector, camera, clock, .. } = rig;
+        let taken =
+            capture(&mut **projector, &mut **camera, &**clock, &self.plan, &mut judge, progress, cancel);
+        let truth = rig.truth();
+        match taken {
+            Ok(record) => Taken { record, failure: None, truth },
+            Err(CaptureFailure { error, partial }) => Taken {
+                record: partial_record(&self.plan, *partial),
+                failure: Some(Reason::from(&*error)),
+                truth,
+            },
+        }
+    }
+
+    /// Decodes what was taken and writes everything; where that cannot be, keeps the frames with a report that says why.
+    ///
+    /// # Errors
+    /// Only storage: whatever is wrong with the frames is a verdict of the report.
+    pub fn finish(&self, taken: &Taken, label: Label, writer: BundleWriter) -> Result<Report, Failure> {
+        let mut manifest = self.manifest(label);
+        manifest.record_capture(&taken.record, self.settings.camera.clone());
+        if let Some(reason) = &taken.failure {
+            return self.keep(taken, reason.clone(), manifest, writer);
+        }
+        let frames = &taken.record.frames;
+        let roles: Vec<_> = frames.iter().map(|captured| captured.role).collect();
+        let planes: Vec<SharedPlane> = frames.iter().map(|captured| shared_plane(&captured.frame)).collect();
+        let job = Job {
+            roles: &roles,
+            planes: &planes,
+            decode: self.decode.clone(),
+            calibration: self.calibration.as_ref(),
+            reconstruct: self.reconstruct,
+        };
+        let outcome = match pipeline::run(&job) {
+            Ok(outcome) => outcome,
+            Err(error) => {
+                let message = format!("the frames were captured but cannot be decoded: {error}");
+                let reason = Reason::failed(Diagnosis::DecodeFailed, message, serde_json::Value::Null);
+                return self.keep(taken, reason, manifest, writer);
+            }
+        };
+        let summary = CaptureSummary::from(&taken.record);
+        let found: Vec<Reason> = taken.record.notes.findings.iter().map(Reason::from).collect();
+        let context = Context {
+            truth: taken.truth.as_ref(),
+            capture: Some(&summary),
+            found: &found,
+            regions: &self.regions,
+            simulated: self.simulated,
+            notes: &[],
+        };
+        let results = Results {
+            job: &job,
+            outcome: &outcome,
+            context: &context,
+            timings: outcome.timings,
+            frames: Some(&planes),
+        };
+        results::write(writer, manifest, &results)
+    }
+
+    fn manifest(&self, label: Label) -> Manifest {
+        let mut manifest = Manifest::new(&self.plan.sequence, FrameFiles::Npy(FRAMES_FILE_NAME.into()));
+        manifest.id = Some(label.id);
+        manifest.label = label.label;
+        manifest.tags = label.tags;
+        manifest.rig = Some(self.rig.clone());
+        let ReconstructSettings { near_mm, far_mm, row_gate_px } = self.reconstruct;
+        manifest.processing = Some(Processing {
+            thresholds: self.settings.thresholds,
+            volume: Some(Volume { near_mm, far_mm }),
+            row_gate_px,
+            regions: self.regions.clone(),
+        });
+        manifest
+    }
+
+    /// Keeps the frames of a capture that came to no result, with a report that says why.
+    fn keep(
+        &self,
+        taken: &Taken,
+        reason: Reason,
+        mut manifest: Manifest,
+        writer: BundleWriter,
+    ) -> Result<Report, Failure> {
+        let record = &taken.record;
+        manifest.sequence = record.frames.iter().map(|captured| captured.role).collect();
+        if let Some(capture) = &mut manifest.capture {
+            capture.failure = Some(reason.clone());
+        }
+        let planes: Vec<SharedPlane> =
+            record.frames.iter().map(|captured| shared_plane(&captured.frame)).collect();
+        let summary = CaptureSummary::from(record);
+        let found: Vec<Reason> =
+            std::iter::once(reason).chain(record.notes.findings.iter().map(Reason::from)).collect();
+        results::write_unfinished(
+            writer,
+            manifest,
+            &self.decode,
+            &planes,
+            self.calibration.as_ref(),
+            |timings| {
+                let size = Size { width: self.decode.width, height: self.decode.height };
+                report::build(&ReportInput {
+                    capture: Some(&summary),
+                    found: &found,
+                    timings,
+                    simulated: self.simulated,
+                    threads: rayon::current_num_threads(),
+                    ..ReportInput::new(self.decode.mode, size, planes.len())
+                })
+            },
+        )
+    }
+}
+
+/// What an unfinished capture left, in the form of a finished one.
+fn partial_record(plan: &Plan, partial: PartialCapture) -> CaptureRecord {
+    CaptureRecord {
+        frames: partial.frames,
+        retaken: partial.retaken,
+        seconds: partial.seconds,
+        limit_seconds: plan.limit().as_secs_f64(),
+        latency_ms: plan.timing.trigger_delay.as_secs_f64() * 1e3,
+        hold_refreshes: plan.timing.hold_refreshes,
+        timing_measured: plan.timing.measured,
+        applied: plan.applied.clone(),
+        statistics: partial.statistics.unwrap_or_default(),
+        notes: partial.notes,
+    }
+}
+
+fn response(applied: &AppliedSettings) -> CameraResponse {
+    CameraResponse {
+        bit_depth: applied.settings.format.bit_depth(),
+        black_level_dn: applied.black_level_dn,
+        saturation_dn: applied.saturation_dn,
+        noise: applied.noise.map(|noise| NoiseModel {
+            gain_dn_per_electron: noise.gain_dn_per_electron,
+            read_noise_dn: noise.read_noise_dn,
+        }),
+    }
+}
+
+fn plan(
+    settings: &Settings,
+    sequence: Sequence,
+    projector: &ProjectorInfo,
+    applied: AppliedSettings,
+) -> Result<Plan, Failure> {
+    let (timing, limits) = (&settings.raw.projector, &settings.raw.capture);
+    let options = PlanOptions {
+        hold_refreshes: (timing.hold_refreshes > 0).then_some(timing.hold_refreshes),
+        trigger_delay: (timing.trigger_delay_ms > 0.0)
+            .then(|| Duration::from_secs_f64(timing.trigger_delay_ms * 1e-3)),
+        retakes_each: limits.retakes_per_pair,
+        retakes_total: limits.retakes_per_scan,
+        ..PlanOptions::default()
+    };
+    Plan::new(sequence, settings.polarization, projector, applied, &options)
+        .map_err(|error: PlanError| setup("plan the capture", error))
+}
+
+/// The rig's calibration, for the frames that the camera delivers: one of the whole sensor is cut to its region.
+fn calibration(
+    settings: &Settings,
+    applied: &AppliedSettings,
+    camera: &CameraInfo,
+    projector: ProjectorSize,
+) -> Result<Option<Calibration>, Failure> {
+    let Some(calibration) = &settings.calibration else {
+        return Ok(None);
+    };
+    let frame = (applied.width, applied.height);
+    let sensor = (camera.sensor_width, camera.sensor_height);
+    let projector = (projector.width, projector.height);
+    let fail = |error: Box<dyn std::error::Error + Send + Sync>| {
+        Failure::data(format!("use the calibration {}", calibration.path.display()), error)
+    };
+    let read = |camera| {
+        let hints = ReadHints {
+            camera_size: Some(camera),
+            projector_size: Some(projector),
+            swap: calibration.projector_left,
+            unit_mm: calibration.unit_mm,
+        };
+        read_calibration(&calibration.path, &hints)
+    };
+    let calibrated = match applied.settings.region {
+        Some(region) if frame != sensor => read(frame)
+            // Files of other tools are read with the size that is expected of them.
+            .or_else(|fault| read(sensor).map_err(|_| fault))
+            .map(|calibrated| match calibrated.camera.size() == sensor {
+                true => calibrated.cropped((region.x, region.y), frame),
+                false => calibrated,
+            }),
+        _ => read(frame),
+    };
+    let calibrated = calibrated.map_err(|error| fail(error.into()))?;
+    calibrated.check_sizes(frame, projector).map_err(|e| fail(e.into()))?;
+    Ok(Some(calibrated))
+}
+
+/// Settings that do not go together.
+fn setup(operation: &'static str, error: impl std::error::Error + Send + Sync + 'static) -> Failure {
+    Failure::Setup { operation, source: Box::new(error) }
+}
+
+/// A rig that cannot be opened, as a failure.
+pub fn rig_failure(error: RigError) -> Failure {
+    match error {
+        error @ RigError::Sim(_) => setup("set up the rig", error),
+        RigError::Device(source) => Failure::Device { operation: "open the devices", source },
+        other => Failure::NoDevice { operation: "open the devices", message: other.to_string() },
+    }
+}
