@@ -175,9 +175,8 @@ fn dispatch(cli: &Cli) -> Result<u8, Failure> {
         Command::Devices(args) => commands::devices(&layers(args, Vec::new()).load()?, cli.json),
         Command::CheckConfig { file } => {
             let args = ConfigArgs { config: Some(file.clone()) };
-            layers(&args, Vec::new()).load()?;
-            commands::config_is_good(file, cli.json);
-            Ok(0)
+            let settings = layers(&args, Vec::new()).load()?;
+            commands::check_config(&settings, file, cli.json)
         }
     }
 }

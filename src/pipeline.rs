@@ -61,8 +61,8 @@ pub fn run(job: &Job) -> Result<Outcome, PipelineError> {
     for (role, plane) in job.roles.iter().zip(job.planes) {
         accumulator.push(*role, plane.clone())?;
     }
-    let decoded = accumulator.finish()?;
-    let decode_ms = milliseconds(start);
+    let mut codes_done = start;
+    let decoded = accumulator.finish_telling(|| codes_done = Instant::now())?;
     let start_triangulate = Instant::now();
     let reconstruction = match job.calibration {
         Some(calibration) if calibration.projector.is_some() => {
@@ -74,7 +74,8 @@ pub fn run(job: &Job) -> Result<Outcome, PipelineError> {
     let after_last_frame = Some(milliseconds(start));
     let contrast = contrast(job, &decoded);
     let timings = Timings {
-        decode: Some(decode_ms),
+        decode: Some(1e3 * codes_done.duration_since(start).as_secs_f64()),
+        subpixel: Some(1e3 * start_triangulate.duration_since(codes_done).as_secs_f64()),
         triangulate: triangulate_ms,
         after_last_frame,
         ..Timings::default()
@@ -82,7 +83,8 @@ pub fn run(job: &Job) -> Result<Outcome, PipelineError> {
     Ok(Outcome { decoded, reconstruction, contrast, timings })
 }
 
-fn milliseconds(since: Instant) -> f64 {
+/// Time since then in ms.
+pub fn milliseconds(since: Instant) -> f64 {
     since.elapsed().as_secs_f64() * 1e3
 }
 
@@ -107,6 +109,12 @@ impl Outcome {
             Some(reconstruction) => &reconstruction.class,
             None => &self.decoded.class,
         }
+    }
+
+    /// Projector row of each pixel: measured, or else what column and calibration predict.
+    pub fn row(&self) -> Option<&Grid<f32>> {
+        let predicted = || self.reconstruction.as_ref()?.predicted_row.as_ref();
+        self.decoded.row.as_ref().map(|row| &row.coordinate).or_else(predicted)
     }
 
     /// z in the camera frame in mm, with a calibration.

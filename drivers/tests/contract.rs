@@ -76,6 +76,7 @@ fn recording() -> Recording {
         height: 30,
         bit_depth: 12,
         frames,
+        pictures: slides(),
         applied: AppliedSettings {
             settings,
             width: 40,
@@ -424,12 +425,41 @@ fn a_recording_answers_with_the_frame_of_the_slide() {
     assert!(matches!(&error, DeviceError::BadData { detail, .. } if detail.contains("black")), "{error}");
     let statistics = open.camera.disarm().unwrap();
     assert_eq!(statistics, StreamStatistics { triggers: 7, frames: 6, failed: 1 });
-    let more = vec![Slide::Uniform(H); SLIDES + 1];
-    assert!(matches!(open.projector.load(&more), Err(DeviceError::Refused { .. })));
+    let other = [slides(), vec![Slide::Uniform(H)]].concat();
+    let error = open.projector.load(&other).unwrap_err();
+    assert!(
+        matches!(&error, DeviceError::Refused { requested, .. } if requested.contains("number 4")),
+        "{error}"
+    );
     // Only what was recorded can be applied.
     let other = CameraSettings { exposure_us: 1999.0, ..open.settings.clone() };
     let error = open.camera.apply(&other).unwrap_err();
     assert!(matches!(error, DeviceError::Refused { setting: "exposure_us", .. }), "{error}");
+}
+
+#[test]
+fn a_part_of_a_recording_is_found_by_its_pictures() {
+    let mut recording = recording();
+    // A reference that was shown at the beginning and again at the end.
+    recording.pictures[3] = recording.pictures[0].clone();
+    let pictures = recording.pictures.clone();
+    let clock: Arc<dyn Clock> = Arc::new(VirtualClock::default());
+    let settings = recording.applied.settings.clone();
+    let rig = ReplayRig::new(recording, clock.clone()).unwrap();
+    let (mut camera, mut projector) =
+        (rig.cameras().open(None).unwrap(), rig.projectors().open(None).unwrap());
+    camera.apply(&settings).unwrap();
+    let slides: Vec<Slide> = [2, 0, 1, 0, 0].map(|picture: usize| pictures[picture].clone()).into();
+    projector.load(&slides).unwrap();
+    camera.arm(slides.len()).unwrap();
+    let shown: Vec<u16> = (0..slides.len() as u32)
+        .map(|slide| {
+            assert_eq!(projector.show(slide).unwrap().slide, Some(slide));
+            camera.trigger(clock.now()).unwrap();
+            samples(&camera.next_frame(Duration::from_secs(1)).unwrap())[0] / 100
+        })
+        .collect();
+    assert_eq!(shown, [2, 0, 1, 3, 3]);
 }
 
 #[test]
@@ -447,4 +477,7 @@ fn recordings_that_contradict_themselves_are_refused() {
     refuse(|recording| recording.bit_depth = 17);
     refuse(|recording| recording.width = 41);
     refuse(|recording| recording.refresh_period = Duration::ZERO);
+    refuse(|recording| recording.pictures.truncate(3));
+    refuse(|recording| recording.applied.settings.exposure_us = -1.0);
+    refuse(|recording| recording.applied.readout_us = f64::INFINITY);
 }

@@ -89,6 +89,8 @@ pub struct Reconstruction {
     pub cloud: Cloud,
     /// Class after the gates of volume and row as well.
     pub class: Grid<Class>,
+    /// Projector row that column and calibration predict, in px, where rows were not coded; NaN where there is no point.
+    pub predicted_row: Option<Grid<f32>>,
     /// Agreement of rows, where rows were coded.
     pub row_check: Option<RowCheck>,
 }

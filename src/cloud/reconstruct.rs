@@ -101,19 +101,22 @@ pub fn reconstruct_with(
     let mut class = decoded.class.clone();
     let mut point_mm = Grid::filled(width, height, [f32::NAN; 3]);
     let mut sigma_z_mm = Grid::filled(width, height, f32::NAN);
-    let mut row_error = Grid::filled(width, height, f32::NAN);
+    // Error of the measured row where rows were coded, else the predicted row.
+    let coded = decoded.row.is_some();
+    let mut row = Grid::filled(width, height, f32::NAN);
     class
         .data_mut()
         .par_chunks_mut(width)
         .zip(point_mm.data_mut().par_chunks_mut(width))
         .zip(sigma_z_mm.data_mut().par_chunks_mut(width))
-        .zip(row_error.data_mut().par_chunks_mut(width))
+        .zip(row.data_mut().par_chunks_mut(width))
         .enumerate()
-        .for_each(|(y, (((class, point), sigma), row_error))| {
+        .for_each(|(y, (((class, point), sigma), row))| {
             for x in (0..width).filter(|&x| decoded.class.at(x, y).is_valid()) {
                 let (verdict, solution) = judge(triangulator, decoded, settings, x, y);
                 if let Some(solution) = &solution {
-                    row_error[x] = solution.row_error_px as f32;
+                    let value = if coded { solution.row_error_px } else { solution.projector_px[1] };
+                    row[x] = value as f32;
                 }
                 match (verdict, solution) {
                     (None, Some(solution)) => {
@@ -124,14 +127,17 @@ pub fn reconstruct_with(
                 }
             }
         });
-    let row_check = decoded
-        .row
-        .is_some()
-        .then(|| check_rows(&row_error, &class, settings.row_gate_px, triangulator.rows_per_column()));
+    let row_check =
+        coded.then(|| check_rows(&row, &class, settings.row_gate_px, triangulator.rows_per_column()));
     let surface = Surface::new(&point_mm, &sigma_z_mm, triangulator.rays());
     let normal = surface::normals(&surface);
     let flags = flags(decoded, &class, &surface::silhouettes(&surface));
-    Ok(Reconstruction { cloud: Cloud { point_mm, normal, sigma_z_mm, flags }, class, row_check })
+    Ok(Reconstruction {
+        cloud: Cloud { point_mm, normal, sigma_z_mm, flags },
+        class,
+        predicted_row: (!coded).then_some(row),
+        row_check,
+    })
 }
 
 fn check(

@@ -14,7 +14,7 @@ use crate::{
     store::{
         Bundle, BundleWriter, FrameSet, Limits, Manifest, Policy,
         manifest::{Capture, Processing, Volume},
-        source::read_calibration,
+        source::{SensorPart, read_calibration_for},
     },
 };
 
@@ -134,6 +134,13 @@ fn summary(sequence: &[Role], capture: &Capture) -> CaptureSummary {
     .with_evidence(&evidence)
 }
 
+/// The part of the sensor that the frames were taken of, where that is recorded.
+fn part(manifest: &Manifest) -> Option<SensorPart> {
+    let camera = &manifest.rig.as_ref()?.camera;
+    let region = manifest.settings.as_ref()?.applied.settings.region?;
+    Some(SensorPart { sensor: (camera.sensor_width, camera.sensor_height), origin: (region.x, region.y) })
+}
+
 /// Sequence and calibration; each may know the projector's size when the other does not.
 fn resolve(
     args: &DecodeArgs,
@@ -149,7 +156,7 @@ fn resolve(
     };
     hints.projector_size = manifest.projector.map(|size| (size.width, size.height));
     let calibration = match args.calibration {
-        Some(path) => Some(read_calibration(path, &hints)?),
+        Some(path) => Some(read_calibration_for(path, &hints, part(manifest))?),
         None => match bundle.calibration()? {
             Some((path, bytes)) => {
                 let name = path.display().to_string();

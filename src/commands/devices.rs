@@ -1,6 +1,4 @@
-//! `polscan devices` and the happy end of `polscan check-config`.
-
-use std::path::Path;
+//! `polscan devices`: what the configured drivers find.
 
 use crate::{
     app,
@@ -28,13 +26,4 @@ pub fn devices(settings: &Settings, json: bool) -> Result<u8, Failure> {
         }
     }
     Ok(0)
-}
-
-/// Says that a configuration has no fault.
-pub fn config_is_good(file: &Path, json: bool) {
-    if json {
-        super::say(serde_json::json!({ "file": file, "faults": [] }));
-    } else {
-        super::say(format_args!("{}: no fault", file.display()));
-    }
 }

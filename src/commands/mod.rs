@@ -1,5 +1,6 @@
 //! What each command of the program does: reads, calls the pure parts, writes, prints.
 
+mod check_config;
 mod decode;
 mod devices;
 mod failure;
@@ -11,8 +12,9 @@ use std::{io::Write, path::Path};
 
 use crate::report::{self, Outputs, Report, Verdict};
 
+pub use check_config::check_config;
 pub use decode::{DecodeArgs, decode};
-pub use devices::{config_is_good, devices};
+pub use devices::devices;
 pub use failure::{USAGE, exit_code, print_failure, print_usage};
 pub use patterns::{Size, patterns};
 pub use scan::scan;

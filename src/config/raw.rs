@@ -26,6 +26,8 @@ pub struct Raw {
     pub capture: Capture,
     /// `[decode]`
     pub decode: Decode,
+    /// `[replay]`
+    pub replay: Replay,
     /// `[sim]`: the simulated rig, needed by the `sim` drivers.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub sim: Option<RigDescription>,
@@ -87,6 +89,16 @@ pub enum DeviceDriver {
     None,
     /// The simulated rig.
     Sim,
+    /// A recorded bundle, given again.
+    Replay,
+}
+
+/// `[replay]`
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Replay {
+    /// Bundle, relative to the configuration file.
+    pub bundle: String,
 }
 
 /// `[camera]`

@@ -37,6 +37,8 @@ pub struct Settings {
     pub polarization: Polarization,
     /// Gates of the decoder.
     pub thresholds: Thresholds,
+    /// Bundle to replay, where a driver needs it, resolved against the folder of the configuration.
+    pub replay: Option<PathBuf>,
     /// Simulated rig and its scene, where a driver needs it.
     pub sim: Option<(RigDescription, Scene)>,
 }
@@ -51,6 +53,7 @@ impl Settings {
         let polarization = polarization(&raw.projector, faults);
         let region = region(&raw.camera.region, faults);
         let sim = sim(&raw, folder, faults);
+        let replay = replay(&raw, folder, faults);
         let calibration = calibration(&raw.rig, folder, faults);
         if !faults.is_empty() {
             return None;
@@ -73,6 +76,7 @@ impl Settings {
                 snap_px: raw.decode.snap_px,
                 fit_edges: raw.decode.fit_edges,
             },
+            replay,
             sim,
             raw,
         })
@@ -112,9 +116,13 @@ fn check_ranges(raw: &Raw, faults: &mut Faults) {
         faults.push(("store.dir".into(), "empty; name a folder".into()));
     }
     let pair = [raw.camera.driver, raw.projector.driver];
-    if pair.contains(&DeviceDriver::Sim) && pair.contains(&DeviceDriver::None) {
-        let message = "a simulated camera sees only a simulated projector; set both drivers to sim or none";
-        faults.push(("camera.driver".into(), message.into()));
+    for (driver, name) in [(DeviceDriver::Sim, "simulated"), (DeviceDriver::Replay, "replaying")] {
+        if pair.contains(&driver) && pair != [driver; 2] {
+            let message =
+                format!("a {name} camera sees only a {name} projector; set both drivers to the same");
+            faults.push(("camera.driver".into(), message));
+            break;
+        }
     }
 }
 
@@ -180,6 +188,21 @@ fn calibration(rig: &raw::Rig, folder: &Path, faults: &mut Faults) -> Option<Rig
         projector_left: rig.calibration_projector_left,
         unit_mm: rig.calibration_unit_mm,
     })
+}
+
+fn replay(raw: &Raw, folder: &Path, faults: &mut Faults) -> Option<PathBuf> {
+    if raw.camera.driver != DeviceDriver::Replay {
+        return None;
+    }
+    let path = folder.join(&raw.replay.bundle);
+    if raw.replay.bundle.is_empty() || !path.exists() {
+        let message = format!(
+            "the replay drivers need a bundle, and there is none at {}; the path is relative to the configuration file",
+            path.display()
+        );
+        faults.push(("replay.bundle".into(), message));
+    }
+    Some(path)
 }
 
 /// A fault of the rig's description, which begins with its key path.

@@ -1,13 +1,12 @@
 //! Takes frames as they come and decodes them.
 
-use polscan_patterns::{Axis, Mode, Role};
+use polscan_patterns::{Axis, Role};
 
 use super::{
-    contrast::{Contrast, contrast},
     gates,
     limits::Gates,
     noise, pair_sum,
-    plan::{Frames, plan, reference_roles},
+    plan::{Frames, plan},
     sample::Sample,
     subpixel,
     types::{Class, DecodeError, DecodeSettings, Decoded, Plane, SharedPlane},
@@ -110,31 +109,19 @@ impl Accumulator {
     /// # Errors
     /// [`DecodeError::Missing`] where the mode cannot do without an absent frame.
     pub fn finish(self) -> Result<Decoded, DecodeError> {
-        match self.frames.first().map(|(_, plane)| plane.plane()) {
-            Some(Plane::U16(_)) => decode::<u16>(&self.settings, &self.frames),
-            _ => decode::<u8>(&self.settings, &self.frames),
-        }
+        self.finish_telling(|| {})
     }
 
-    /// Contrast (Eq. 8) of the code frames that have come, `None` without a dark reference or without code frames.
-    /// `lit` tells which pixels see projector light, as [`Decoded::class`] does.
-    pub fn contrast(&self, lit: &Grid<bool>) -> Option<Contrast> {
-        let (dark, _) = reference_roles(self.settings.mode);
-        let of = |wanted: &dyn Fn(Role) -> bool| -> Vec<Plane<'_>> {
-            let mut found: Vec<_> = self.frames.iter().filter(|(role, _)| wanted(*role)).collect();
-            found.sort_by_key(|(role, _)| match role {
-                Role::Code { axis, bit, .. } => (*axis == Axis::Row, *bit),
-                _ => (false, 0),
-            });
-            found.into_iter().map(|(_, plane)| plane.plane()).collect()
-        };
-        let fast = self.settings.mode == Mode::Fast;
-        let code = of(
-            &|role| matches!(role, Role::Code { axis, inverse: false, .. } if !(fast && axis == Axis::Row)),
-        );
-        let dark = of(&|role| role == dark);
-        let camera = self.settings.camera;
-        contrast(&code, &dark, camera.bit_depth, camera.black_level_dn.unwrap_or(0.0), lit)
+    /// As [`finish`](Self::finish); calls `codes_done` when all codes are there and only sub-pixel coordinates are
+    /// missing, for a caller with a clock.
+    ///
+    /// # Errors
+    /// As [`finish`](Self::finish).
+    pub fn finish_telling(self, codes_done: impl FnOnce()) -> Result<Decoded, DecodeError> {
+        match self.frames.first().map(|(_, plane)| plane.plane()) {
+            Some(Plane::U16(_)) => decode::<u16>(&self.settings, &self.frames, codes_done),
+            _ => decode::<u8>(&self.settings, &self.frames, codes_done),
+        }
     }
 }
 
@@ -148,6 +135,7 @@ impl std::fmt::Debug for Accumulator {
 fn decode<T: Sample>(
     settings: &DecodeSettings,
     pushed: &[(Role, SharedPlane)],
+    codes_done: impl FnOnce(),
 ) -> Result<Decoded, DecodeError> {
     let mut frames = plan::<T>(settings, pushed)?;
     let camera = settings.camera;
@@ -171,6 +159,7 @@ fn decode<T: Sample>(
     let pairs = pair_sum::of_scan(&frames, &maps, &gates);
     let drift = drift(&frames, &maps);
     let (boundaries, shapes) = gates::apply(&frames, &mut maps, &settings.thresholds);
+    codes_done();
     let mut refined = shapes
         .iter()
         .enumerate()

@@ -7,7 +7,7 @@ use crate::{
     cloud::{CloudFrame, write_ply},
     decode::{DecodeSettings, SharedPlane},
     geometry::Calibration,
-    pipeline::{self, Context, Job, Outcome},
+    pipeline::{self, Context, Job, Outcome, milliseconds},
     report::{Report, Timings},
     store::{BundleWriter, Manifest, bundle, error::StorageError, maps::Maps},
 };
@@ -32,7 +32,8 @@ pub fn write(writer: BundleWriter, mut manifest: Manifest, results: &Results) ->
     let failed = |error: StorageError| Failure::storage("write the result", error);
     let Results { job, outcome, context, .. } = results;
     let depth_mm = outcome.depth_mm();
-    let maps = Maps::new(&outcome.decoded, outcome.class(), depth_mm.as_ref()).map_err(failed)?;
+    let maps =
+        Maps::new(&outcome.decoded, outcome.class(), outcome.row(), depth_mm.as_ref()).map_err(failed)?;
     let frames = || results.frames.map_or(Ok(()), |frames| write_frames(&writer, &job.decode, frames));
     let data = || writer.maps(&maps).and_then(|()| write_cloud(&writer, results));
     let (frames, (data, pictures)) =
@@ -81,10 +82,6 @@ fn write_calibration(
     let Some(calibration) = calibration else { return Ok(()) };
     manifest.calibration = Some(bundle::CALIBRATION_FILE_NAME.into());
     writer.bytes(bundle::CALIBRATION_FILE_NAME, calibration.to_toml().as_bytes())
-}
-
-fn milliseconds(since: Instant) -> f64 {
-    since.elapsed().as_secs_f64() * 1e3
 }
 
 fn write_report(writer: &BundleWriter, report: &Report) -> Result<(), Failure> {

@@ -30,7 +30,7 @@ use crate::{
         BundleWriter, Manifest,
         bundle::FRAMES_FILE_NAME,
         manifest::{self, FrameFiles, Processing, Volume},
-        source::read_calibration,
+        source::{SensorPart, read_calibration_for},
     },
     truth::Truth,
     verify::{PairSumJudge, shared_plane},
@@ -108,7 +108,7 @@ impl Scan {
         let plan = plan(settings, sequence, &projector, applied)?;
         // What no frames can be decoded with is refused before any is captured.
         Accumulator::new(decode.clone()).map_err(|error| setup("decode with these settings", error))?;
-        let rig = manifest::Rig {
+        let described = manifest::Rig {
             name: settings.raw.rig.name.clone(),
             camera,
             projector,
@@ -125,9 +125,9 @@ impl Scan {
                 row_gate_px: settings.raw.decode.row_gate_px,
             },
             regions: regions.to_vec(),
-            rig,
+            rig: described,
             settings: settings.clone(),
-            simulated: settings.sim.is_some(),
+            simulated: rig.is_simulated(),
         })
     }
 
@@ -328,31 +328,22 @@ fn calibration(
         return Ok(None);
     };
     let frame = (applied.width, applied.height);
-    let sensor = (camera.sensor_width, camera.sensor_height);
     let projector = (projector.width, projector.height);
     let fail = |error: Box<dyn std::error::Error + Send + Sync>| {
         Failure::data(format!("use the calibration {}", calibration.path.display()), error)
     };
-    let read = |camera| {
-        let hints = ReadHints {
-            camera_size: Some(camera),
-            projector_size: Some(projector),
-            swap: calibration.projector_left,
-            unit_mm: calibration.unit_mm,
-        };
-        read_calibration(&calibration.path, &hints)
+    let hints = ReadHints {
+        camera_size: Some(frame),
+        projector_size: Some(projector),
+        swap: calibration.projector_left,
+        unit_mm: calibration.unit_mm,
     };
-    let calibrated = match applied.settings.region {
-        Some(region) if frame != sensor => read(frame)
-            // Files of other tools are read with the size that is expected of them.
-            .or_else(|fault| read(sensor).map_err(|_| fault))
-            .map(|calibrated| match calibrated.camera.size() == sensor {
-                true => calibrated.cropped((region.x, region.y), frame),
-                false => calibrated,
-            }),
-        _ => read(frame),
-    };
-    let calibrated = calibrated.map_err(|error| fail(error.into()))?;
+    let part = applied.settings.region.map(|region| SensorPart {
+        sensor: (camera.sensor_width, camera.sensor_height),
+        origin: (region.x, region.y),
+    });
+    let calibrated =
+        read_calibration_for(&calibration.path, &hints, part).map_err(|error| fail(error.into()))?;
     calibrated.check_sizes(frame, projector).map_err(|e| fail(e.into()))?;
     Ok(Some(calibrated))
 }
@@ -366,6 +357,7 @@ fn setup(operation: &'static str, error: impl std::error::Error + Send + Sync + 
 pub fn rig_failure(error: RigError) -> Failure {
     match error {
         error @ RigError::Sim(_) => setup("set up the rig", error),
+        error @ RigError::Replay { .. } => Failure::data("open the devices", error),
         RigError::Device(source) => Failure::Device { operation: "open the devices", source },
         other => Failure::NoDevice { operation: "open the devices", message: other.to_string() },
     }

@@ -27,9 +27,10 @@ const MAX_SIDE: u32 = 32_768;
 const MAX_FOCAL_SIDES: f64 = 100.0;
 /// A shorter lens would see more than 157 degrees, where the pinhole model has no meaning.
 const MIN_FOCAL_SIDES: f64 = 0.1;
-/// Lens shift puts the principal point outside the image, and so does a small region in a corner of a sensor; a point
-/// farther off than this many sides is a diverged number.
-const PRINCIPAL_MARGIN: f64 = 10.0;
+/// Lens shift puts the principal point outside the image, but not by more than this many sides.
+const PRINCIPAL_MARGIN: f64 = 0.5;
+/// A small region in a corner of a sensor has it farther out, within the field of the lens: this many focal lengths.
+const PRINCIPAL_FIELD: f64 = 0.7;
 /// Pixels of diamond micro-mirrors have 1:2; anything far beyond is a swapped or diverged number.
 const MAX_ASPECT: f64 = 2.5;
 /// Newton steps of the inverse; a monotone lens needs fewer than ten.
@@ -174,9 +175,11 @@ impl Lens {
             return faults;
         }
         self.focal_faults(who, &mut faults);
-        for (name, value, side) in [("cx", self.cx, self.width), ("cy", self.cy, self.height)] {
-            let (low, high) =
-                (-PRINCIPAL_MARGIN * f64::from(side), (1.0 + PRINCIPAL_MARGIN) * f64::from(side));
+        let axes = [("cx", self.cx, self.width, self.fx), ("cy", self.cy, self.height, self.fy)];
+        for (name, value, side, focal) in axes {
+            let middle = 0.5 * f64::from(side);
+            let reach = ((0.5 + PRINCIPAL_MARGIN) * f64::from(side)).max(PRINCIPAL_FIELD * focal);
+            let (low, high) = (middle - reach, middle + reach);
             if !(low..=high).contains(&value) {
                 faults.push(format!(
                     "{who} {name} is {value:.1} px, implausible for {side} px (expected {low:.0} to {high:.0}): \
@@ -407,7 +410,8 @@ mod tests {
         named(Lens { fx: f64::NAN, cy: f64::INFINITY, ..narrow() }, &["fx is NaN", "cy is inf"]);
         named(Lens { fx: -4638.0, width: 0, ..narrow() }, &["width is 0"]);
         named(Lens { fx: -4638.0, ..narrow() }, &["fx is -4638 px, expected a positive"]);
-        named(Lens { cx: 2500.0, cy: -700.0, ..narrow() }, &["cx is 2500.0 px", "cy is -700.0 px"]);
+        named(Lens { cx: 4500.0, cy: -2700.0, ..narrow() }, &["cx is 4500.0 px", "cy is -2700.0 px"]);
+        assert_eq!(narrow().cropped((0, 900), (160, 120)).faults("camera"), Vec::<String>::new());
         // A diverged fit of a telecentric view: everything is finite and smooth over the image, but absurd.
         let diverged = Lens {
             width: 512,

@@ -44,6 +44,8 @@ pub struct Solution {
     pub point_mm: [f64; 3],
     /// Standard deviation of z in mm.
     pub sigma_z_mm: f64,
+    /// Where the projector's lens has the point: column and row in projector px.
+    pub projector_px: [f64; 2],
     /// Signed distance of the measured projector pixel from the camera pixel's epipolar line, in projector px. With
     /// a horizontal baseline this is measured minus predicted row. NaN where one of the axes was not measured.
     pub row_error_px: f64,
@@ -165,6 +167,7 @@ impl Triangulator {
         Some(Solution {
             point_mm: [dx * z, dy * z, z],
             sigma_z_mm: z * z / information.sqrt(),
+            projector_px: seen.pixel,
             row_error_px,
             row_error_sigma_px,
             rows_per_column: dv / du,

@@ -93,6 +93,7 @@ pub fn reconstruction(decoded: &Decoded) -> Reconstruction {
             flags: Grid::filled(width, height, 0),
         },
         class: decoded.class.clone(),
+        predicted_row: None,
         row_check: Some(RowCheck {
             median_px: 0.01,
             sigma_px: 0.05,

@@ -23,7 +23,7 @@ pub const TRUTH_FILE_NAME: &str = "truth.npz";
 pub struct Maps {
     /// Projector column.
     pub column: Grid<f32>,
-    /// Projector row; all NaN where rows were not coded.
+    /// Projector row; all NaN where rows were neither coded nor predicted by a calibration.
     pub row: Grid<f32>,
     /// z in the camera frame in mm; all NaN without a calibration.
     pub depth_mm: Grid<f32>,
@@ -38,11 +38,13 @@ pub struct Maps {
 }
 
 impl Maps {
-    /// The maps of `decoded` after all gates, which `class` tells of. `depth_mm` is there where a calibration is.
+    /// The maps of `decoded` after all gates, which `class` tells of. `row` is there where rows were coded
+    /// or a calibration predicts them, `depth_mm` where a calibration is.
     /// Refuses, as a defect, valid pixels without a column, or without a row or depth where there are rows or depths.
     pub fn new(
         decoded: &Decoded,
         class: &Grid<Class>,
+        row: Option<&Grid<f32>>,
         depth_mm: Option<&Grid<f32>>,
     ) -> Result<Self, StorageError> {
         let mask = class.map(|class| class.is_valid());
@@ -68,8 +70,8 @@ impl Maps {
         };
         let nowhere = || Grid::filled(size.0, size.1, f32::NAN);
         let column = masked("column", &decoded.column.coordinate)?;
-        let row = match &decoded.row {
-            Some(row) => masked("row", &row.coordinate)?,
+        let row = match row {
+            Some(row) => masked("row", row)?,
             None => nowhere(),
         };
         let depth_mm = match depth_mm {

@@ -13,7 +13,7 @@ mod pnm;
 pub mod source;
 pub mod time;
 
-pub use bundle::{BundleWriter, WriteTimings};
+pub use bundle::BundleWriter;
 pub use error::{Fault, Faults, InputError, StorageError};
 pub use frames::{FrameSet, Limits};
 pub use manifest::Manifest;

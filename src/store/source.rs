@@ -298,6 +298,36 @@ pub(crate) fn read_bounded(
     Ok(bytes)
 }
 
+/// The part of a sensor that frames show.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct SensorPart {
+    /// (width, height) of the whole sensor.
+    pub sensor: (u32, u32),
+    /// (column, row) of the sensor where the frames begin.
+    pub origin: (u32, u32),
+}
+
+/// A calibration file given by a person, for frames of the size in `hints` that show `part` of the sensor: one of the
+/// whole sensor is cut to it.
+pub fn read_calibration_for(
+    path: &Path,
+    hints: &ReadHints,
+    part: Option<SensorPart>,
+) -> Result<Calibration, CalibrationFileError> {
+    let read = read_calibration(path, hints);
+    let (Some(part), Some(frame)) = (part, hints.camera_size) else { return read };
+    if part.sensor == frame {
+        return read;
+    }
+    // Files of other tools are read with the size that is expected of them.
+    let whole = ReadHints { camera_size: Some(part.sensor), ..*hints };
+    let calibration = read.or_else(|fault| read_calibration(path, &whole).map_err(|_| fault))?;
+    Ok(match calibration.camera.size() == part.sensor {
+        true => calibration.cropped(part.origin, frame),
+        false => calibration,
+    })
+}
+
 /// A calibration file given by a person, in any format that is known.
 pub fn read_calibration(path: &Path, hints: &ReadHints) -> Result<Calibration, CalibrationFileError> {
     let bytes = read_bounded(path, Policy::Local, "read calibration", geometry::MAX_BYTES)?;

@@ -24,6 +24,28 @@ fn all_faults_of_a_configuration_come_at_once() {
 }
 
 #[test]
+fn check_config_looks_into_the_calibration() {
+    let rig = Rig::small();
+    rig.scan("scan", &["--mode", "fast"]).expect(0);
+    let config = rig.path("rig.toml");
+    polscan(&["check-config", text(&config)]).expect(0);
+    let path = rig.path("sim-calibration.toml");
+    let calibration = fs::read_to_string(&path).expect("the calibration");
+    for (wrong, word) in [
+        (calibration.replace("size = [400, 300]", "size = [300, 400]"), "exchanged"),
+        (calibration.replace("translation_mm = [", "translation_mm = [nan, "), "translation_mm"),
+        (String::new(), "calibration"),
+    ] {
+        assert_ne!(wrong, calibration);
+        fs::write(&path, wrong).expect("the calibration is written");
+        let run = polscan(&["check-config", "--json", text(&config)]).expect(64);
+        assert!(run.stderr.contains("rig.calibration") && run.stderr.contains(word), "{}", run.stderr);
+        let printed: serde_json::Value = serde_json::from_str(&run.stdout).expect("one object on stdout");
+        assert_eq!(printed["error"]["faults"][0]["key"], "rig.calibration");
+    }
+}
+
+#[test]
 fn an_occupied_folder_is_refused_and_left_alone() {
     let rig = Rig::small();
     fs::create_dir(rig.path("scan")).expect("a folder");
@@ -87,5 +109,8 @@ fn wrong_usage_is_2() {
     polscan(&["scan"]).expect(2);
     polscan(&["scan", "--mode", "fringe", "--out", "x"]).expect(2);
     polscan(&["scan", "--region", "a=1,2,3", "--out", "x"]).expect(2);
-    polscan(&["frobnicate"]).expect(2);
+    let run = polscan(&["frobnicate", "--json"]).expect(2);
+    let printed: serde_json::Value = serde_json::from_str(&run.stdout).expect("one object on stdout");
+    assert_eq!((&printed["error"]["type"], &printed["exit_code"]), (&"usage".into(), &2.into()));
+    assert!(run.stderr.contains("frobnicate"), "{}", run.stderr);
 }

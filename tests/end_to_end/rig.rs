@@ -82,6 +82,16 @@ impl Rig {
     }
 }
 
+impl Rig {
+    /// Width and values of an array of an archive of the result in `out`.
+    pub fn map(&self, out: &str, archive: &str, name: &str) -> (usize, Vec<f32>) {
+        let bytes = self.bytes(out, archive);
+        let mut arrays = polscan::store::npz::read(std::io::Cursor::new(bytes)).expect("an archive");
+        let grid = arrays.take_f32(name).expect("an array of the archive");
+        (grid.width(), grid.data().to_vec())
+    }
+}
+
 /// What a run of the program came to.
 pub struct Run {
     /// Exit code.

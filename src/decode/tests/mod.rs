@@ -1,6 +1,5 @@
 //! Tests of the decoder as a whole.
 
-mod captures;
 mod exact;
 mod scenarios;
 mod simulated;

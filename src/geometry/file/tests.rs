@@ -567,18 +567,17 @@ fn sizes_are_compared_with_the_scan() {
     assert!(message.contains("a projector of 1024x768 px, the scan of 1920x1080 px"), "{message}");
 }
 
-/// The folder of captures, or a plain word that the test did not run.
-fn captures(test: &str) -> Option<PathBuf> {
-    let folder = std::env::var_os("POLSCAN_CAPTURES").map(PathBuf::from);
-    if folder.is_none() {
-        eprintln!("{test} DID NOT RUN: set POLSCAN_CAPTURES to the folder of captures");
-    }
-    folder
+/// The folder of captures.
+fn captures() -> PathBuf {
+    std::env::var_os("POLSCAN_CAPTURES")
+        .map(PathBuf::from)
+        .expect("POLSCAN_CAPTURES names the folder of captures")
 }
 
 #[test]
+#[ignore = "needs the captures of `make captures`"]
 fn captured_bouguet_files() {
-    let Some(folder) = captures("captured_bouguet_files") else { return };
+    let folder = captures();
     let folder = folder.join("bouguet-example");
     for name in ["Calib_Results_old0.m", "Calib_Results_old0.mat"] {
         let calibration = read_file(&folder.join(name)).unwrap();
@@ -616,8 +615,9 @@ fn captured_bouguet_files() {
 }
 
 #[test]
+#[ignore = "needs the captures of `make captures`"]
 fn captured_opencv_files() {
-    let Some(folder) = captures("captured_opencv_files") else { return };
+    let folder = captures();
     let left = read_file(&folder.join("opencv-stereo/left_intrinsics.yml")).unwrap();
     assert!((left.camera.fx - 535.916).abs() < 5e-4 && (left.camera.cx - 342.283).abs() < 5e-4);
     assert_eq!(left.camera.size(), (640, 480));

@@ -1,16 +1,18 @@
-//! One file of a bundle, hashed while it is written.
+//! One file of a bundle while it is written.
 
 use std::{
     fs,
     io::{self, Write},
     path::{Path, PathBuf},
-    time::{Duration, Instant},
 };
 
-use sha2::{Digest, Sha256};
-
 use super::BundleWriter;
-use crate::store::{disk::DiskFile, error::StorageError, manifest::FileEntry, source::hex};
+use crate::store::{
+    disk::DiskFile,
+    error::StorageError,
+    manifest::FileEntry,
+    source::{Policy, hash_file},
+};
 
 /// Small writes are gathered up to this many bytes.
 const BUFFER_BYTES: usize = 1 << 18;
@@ -23,10 +25,30 @@ pub struct BundleFile<'a> {
     path: PathBuf,
     out: Option<Box<dyn DiskFile>>,
     buffer: Vec<u8>,
-    digest: Sha256,
     bytes: u64,
-    hashing: Duration,
     failed: bool,
+}
+
+/// A file that is complete but not yet known to be on the medium.
+pub(super) struct Written {
+    pub(super) name: String,
+    path: PathBuf,
+    bytes: u64,
+    out: Box<dyn DiskFile>,
+}
+
+impl Written {
+    /// Brings the file to the medium and hashes what is there.
+    pub(super) fn seal(mut self) -> Result<(String, FileEntry), StorageError> {
+        self.out.sync().map_err(|error| StorageError::file("sync", &self.path, error))?;
+        let entry = hash_file(&self.path, Policy::Local)
+            .map_err(|error| StorageError::file("hash", &self.path, io::Error::other(error)))?;
+        if entry.bytes != self.bytes {
+            let detail = format!("{} bytes were written, {} are there", self.bytes, entry.bytes);
+            return Err(StorageError::refused(&self.name, detail));
+        }
+        Ok((self.name, entry))
+    }
 }
 
 impl std::fmt::Debug for BundleFile<'_> {
@@ -46,9 +68,7 @@ impl<'a> BundleFile<'a> {
             path,
             out: Some(out),
             buffer: Vec::new(),
-            digest: Sha256::new(),
             bytes: 0,
-            hashing: Duration::ZERO,
             failed: false,
         }
     }
@@ -68,13 +88,8 @@ impl<'a> BundleFile<'a> {
         let Some(out) = self.out.take() else {
             return Err(StorageError::refused(&self.name, "was committed already"));
         };
-        let start = Instant::now();
-        let sha256 = hex(&std::mem::take(&mut self.digest).finalize());
-        self.hashing += start.elapsed();
-        let mut progress = self.writer.progress();
-        progress.hashing += self.hashing;
-        progress.files.insert(self.name.clone(), FileEntry { bytes: self.bytes, sha256 });
-        progress.unsynced.push((self.path.clone(), out));
+        let written = Written { name: self.name.clone(), path: self.path.clone(), bytes: self.bytes, out };
+        self.writer.progress().written.push(written);
         Ok(())
     }
 
@@ -84,9 +99,6 @@ impl<'a> BundleFile<'a> {
             self.failed = true;
             return Err(error);
         }
-        let start = Instant::now();
-        self.digest.update(data);
-        self.hashing += start.elapsed();
         self.bytes += data.len() as u64;
         Ok(())
     }

@@ -1,23 +1,22 @@
-//! Writing a bundle: everything or nothing. Files are written and hashed in a folder `NAME.partial` beside the target,
-//! brought to the medium, followed by the manifest, and only then the folder gets its name.
+//! Writing a bundle: everything or nothing. Files are written in a folder `NAME.partial` beside the target,
+//! brought to the medium and hashed, followed by the manifest, and only then the folder gets its name.
 
 mod file;
 mod place;
 
 use std::{
-    collections::{BTreeMap, BTreeSet},
+    collections::BTreeSet,
     fs, io,
     path::{Component, Path, PathBuf},
     sync::{Arc, Mutex, MutexGuard, PoisonError},
-    time::{Duration, Instant},
 };
 
 use rayon::prelude::*;
 
 use super::{
-    disk::{Disk, DiskFile, RealDisk},
+    disk::{Disk, RealDisk},
     error::StorageError,
-    manifest::{self, FileEntry, FrameFiles, Manifest},
+    manifest::{self, FrameFiles, Manifest},
     maps::{self, Maps},
     npy::FrameStream,
     npz::{self, Array},
@@ -28,6 +27,7 @@ use crate::{decode::Plane, truth::Truth};
 pub use file::BundleFile;
 pub use place::{remove_stale_partials, stale_partials};
 
+use file::Written;
 use place::Place;
 
 /// Name of the frames in our own bundles.
@@ -35,15 +35,6 @@ pub const FRAMES_FILE_NAME: &str = "frames.npy";
 
 /// Name of the calibration in our own bundles.
 pub const CALIBRATION_FILE_NAME: &str = "calibration.toml";
-
-/// Time that a bundle took besides writing.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct WriteTimings {
-    /// Spent on hashing while files were written, summed over threads.
-    pub hashing: Duration,
-    /// From the call of `finish` until everything was on the medium under its name.
-    pub finishing: Duration,
-}
 
 /// A bundle that is being written. Dropping it unfinished leaves nothing behind.
 pub struct BundleWriter {
@@ -64,12 +55,10 @@ impl std::fmt::Debug for BundleWriter {
 struct Progress {
     /// Names given out, so that no file is written twice.
     names: BTreeSet<String>,
-    files: BTreeMap<String, FileEntry>,
-    unsynced: Vec<(PathBuf, Box<dyn DiskFile>)>,
+    written: Vec<Written>,
     folders: BTreeSet<PathBuf>,
     /// Number of frames in `frames.npy`, once it is committed.
     frames: Option<usize>,
-    hashing: Duration,
 }
 
 impl BundleWriter {
@@ -191,16 +180,12 @@ impl BundleWriter {
 
     /// Brings everything to the medium, writes the manifest with the hashes of all files, and gives the folder its name.
     /// Returns the manifest as written.
-    pub fn finish(mut self, mut manifest: Manifest) -> Result<(Manifest, WriteTimings), StorageError> {
-        let start = Instant::now();
+    pub fn finish(mut self, mut manifest: Manifest) -> Result<Manifest, StorageError> {
         let progress = self.progress.get_mut().unwrap_or_else(PoisonError::into_inner);
-        let Progress { files, mut unsynced, folders, frames, hashing, .. } = std::mem::take(progress);
-        manifest.files = files;
-        check(&manifest, frames)?;
-        unsynced.par_iter_mut().try_for_each(|(path, file)| {
-            file.sync().map_err(|error| StorageError::file("sync", path, error))
-        })?;
-        drop(unsynced);
+        let Progress { written, folders, frames, .. } = std::mem::take(progress);
+        let names: BTreeSet<&str> = written.iter().map(|file| file.name.as_str()).collect();
+        check(&manifest, &names, frames)?;
+        manifest.files = written.into_par_iter().map(Written::seal).collect::<Result<_, _>>()?;
         let sync = |folder: &Path| {
             self.disk.sync_folder(folder).map_err(|error| StorageError::file("sync folder", folder, error))
         };
@@ -217,7 +202,7 @@ impl BundleWriter {
         drop(file);
         self.place.publish(&*self.disk)?;
         self.finished = true;
-        Ok((manifest, WriteTimings { hashing, finishing: start.elapsed() }))
+        Ok(manifest)
     }
 }
 
@@ -229,9 +214,9 @@ impl Drop for BundleWriter {
     }
 }
 
-/// Whether a bundle with `manifest`, in whose own `frames.npy` are `frames`, is what its manifest says. It need not be
+/// Whether a bundle of `files` with `manifest`, in whose own `frames.npy` are `frames`, is what its manifest says. It need not be
 /// decodable: a capture that was cut short, even before its first frame, is kept as well.
-fn check(manifest: &Manifest, frames: Option<usize>) -> Result<(), StorageError> {
+fn check(manifest: &Manifest, files: &BTreeSet<&str>, frames: Option<usize>) -> Result<(), StorageError> {
     let refused = |detail: String| Err(StorageError::refused(manifest::FILE_NAME, detail));
     if let Err(faults) = manifest.check_form(Policy::Local) {
         return refused(faults.to_string());
@@ -249,10 +234,10 @@ fn check(manifest: &Manifest, frames: Option<usize>) -> Result<(), StorageError>
             "has {entries} entries in `sequence` for {frames} frames in {FRAMES_FILE_NAME}"
         ));
     }
-    if manifest.truth_objects.is_some() != manifest.files.contains_key(maps::TRUTH_FILE_NAME) {
+    if manifest.truth_objects.is_some() != files.contains(maps::TRUTH_FILE_NAME) {
         return refused(format!("{} and the names of its objects belong together", maps::TRUTH_FILE_NAME));
     }
-    match named.into_iter().find(|name| !manifest.files.contains_key(*name)) {
+    match named.into_iter().find(|name| !files.contains(name.as_str())) {
         Some(name) => refused(format!("names {name}, which is not in the bundle")),
         None => Ok(()),
     }

@@ -43,13 +43,16 @@ fn values_are_there_exactly_where_the_mask_is() {
     // A later gate takes the second pixel out again.
     let class = Grid::from_vec(4, 1, vec![Class::Valid, Class::RowGate, Class::Inverted, Class::Unlit]);
     let depth = Grid::from_vec(4, 1, vec![900.0, 901.0, 902.0, 903.0]);
-    let maps = Maps::new(&decoded, &class, Some(&depth)).unwrap();
+    let maps = Maps::new(&decoded, &class, None, Some(&depth)).unwrap();
     assert_eq!(maps.mask.data(), [true, false, true, false]);
     assert_eq!(nans(&maps.column), [false, true, false, true]);
     assert_eq!(nans(&maps.depth_mm), [false, true, false, true]);
     assert_eq!(nans(&maps.row), [true; 4]);
     assert_eq!(maps.class.data(), [1, 9, 3, 0]);
-    let without = Maps::new(&decoded, &class, None).unwrap();
+    let row = Grid::from_vec(4, 1, vec![7.0; 4]);
+    let with_row = Maps::new(&decoded, &class, Some(&row), None).unwrap();
+    assert_eq!(nans(&with_row.row), [false, true, false, true]);
+    let without = Maps::new(&decoded, &class, None, None).unwrap();
     assert_eq!(nans(&without.depth_mm), [true; 4]);
     let mut bytes = Vec::new();
     maps.write(&mut bytes).unwrap();
@@ -62,9 +65,9 @@ fn values_are_there_exactly_where_the_mask_is() {
 #[test]
 fn a_valid_pixel_without_a_value_is_a_defect() {
     let decoded = decoded(vec![f32::NAN, 1.0], vec![Class::Valid, Class::Valid]);
-    let error = Maps::new(&decoded, &decoded.class, None).unwrap_err().to_string();
+    let error = Maps::new(&decoded, &decoded.class, None, None).unwrap_err().to_string();
     assert!(error.contains("1 valid pixels have no column"), "{error}");
     let depth = Grid::filled(3, 1, 1.0);
-    let error = Maps::new(&decoded, &decoded.class, Some(&depth)).unwrap_err().to_string();
+    let error = Maps::new(&decoded, &decoded.class, None, Some(&depth)).unwrap_err().to_string();
     assert!(error.contains("column"), "{error}");
 }

@@ -1,0 +1,153 @@
+//! The only place that names concrete drivers: settings in, devices out.
+
+use std::{path::PathBuf, sync::Arc};
+
+use polscan_drivers::{
+    camera::{Camera, CameraDriver, Listing},
+    clock::{Clock, MonotonicClock, VirtualClock},
+    error::DeviceError,
+    projector::{Projector, ProjectorDriver},
+    sim,
+};
+use thiserror::Error;
+
+mod replay;
+
+use crate::{
+    config::{DeviceDriver, Settings},
+    grid::Grid,
+    truth::{Truth, TruthObject},
+};
+
+/// Why the devices of a rig cannot be had.
+#[derive(Debug, Error)]
+pub enum RigError {
+    /// The configuration names no device.
+    #[error("no {0} is configured: set {0}.driver in the file given with --config, as config/sim.toml does")]
+    NotConfigured(&'static str),
+    /// The simulated rig cannot be set up.
+    #[error(transparent)]
+    Sim(#[from] sim::RigError),
+    /// The bundle cannot be replayed.
+    #[error("cannot replay {}", bundle.display())]
+    Replay {
+        /// Bundle.
+        bundle: PathBuf,
+        /// Why not.
+        #[source]
+        source: Box<dyn std::error::Error + Send + Sync>,
+    },
+    /// A driver says no.
+    #[error(transparent)]
+    Device(#[from] DeviceError),
+}
+
+/// The devices of a scan, on one clock.
+pub struct Rig {
+    /// Clock that both devices and the sequencer share.
+    pub clock: Arc<dyn Clock>,
+    /// Camera.
+    pub camera: Box<dyn Camera>,
+    /// Projector.
+    pub projector: Box<dyn Projector>,
+    knows: Knowledge,
+}
+
+/// What a rig knows of its scene.
+enum Knowledge {
+    Nothing,
+    Sim(sim::Rig),
+    Recorded(Box<replay::Recorded>),
+}
+
+impl Rig {
+    /// Opens what the settings ask for.
+    pub fn open(settings: &Settings) -> Result<Self, RigError> {
+        let Families { cameras, projectors, clock, knows } = families(settings)?;
+        let (camera, projector) = (&settings.raw.camera, &settings.raw.projector);
+        let cameras = cameras.ok_or(RigError::NotConfigured("camera"))?;
+        let projectors = projectors.ok_or(RigError::NotConfigured("projector"))?;
+        let some = |serial: &str| (!serial.is_empty()).then(|| serial.to_string());
+        Ok(Self {
+            clock,
+            camera: cameras.open(some(&camera.serial).as_deref())?,
+            projector: projectors.open(some(&projector.serial).as_deref())?,
+            knows,
+        })
+    }
+
+    /// Whether what this rig measures is computed rather than seen.
+    pub fn is_simulated(&self) -> bool {
+        match &self.knows {
+            Knowledge::Nothing => false,
+            Knowledge::Sim(_) => true,
+            Knowledge::Recorded(recorded) => recorded.simulated,
+        }
+    }
+
+    /// What the rig knows of its scene, for a simulated one or a recording of one.
+    pub fn truth(&self) -> Option<Truth> {
+        match &self.knows {
+            Knowledge::Nothing => None,
+            Knowledge::Sim(rig) => Some(truth_maps(&rig.truth())),
+            Knowledge::Recorded(recorded) => recorded.truth.clone(),
+        }
+    }
+}
+
+/// All cameras and all projectors that the configured drivers find.
+pub fn list(settings: &Settings) -> Result<(Vec<Listing>, Vec<Listing>), RigError> {
+    let Families { cameras, projectors, .. } = families(settings)?;
+    let cameras = cameras.map_or(Ok(Vec::new()), |driver| driver.list())?;
+    Ok((cameras, projectors.map_or(Ok(Vec::new()), |driver| driver.list())?))
+}
+
+/// The configured drivers; `None` for a device that is not configured.
+struct Families {
+    cameras: Option<Box<dyn CameraDriver>>,
+    projectors: Option<Box<dyn ProjectorDriver>>,
+    clock: Arc<dyn Clock>,
+    knows: Knowledge,
+}
+
+fn families(settings: &Settings) -> Result<Families, RigError> {
+    if let (Some((description, scene)), DeviceDriver::Sim) = (&settings.sim, settings.raw.camera.driver) {
+        let clock = description.pacing.clock();
+        let rig = sim::Rig::new(description, scene, clock.clone())?;
+        return Ok(Families {
+            cameras: Some(Box::new(rig.cameras())),
+            projectors: Some(Box::new(rig.projectors())),
+            clock,
+            knows: Knowledge::Sim(rig),
+        });
+    }
+    if let Some(bundle) = &settings.replay {
+        let clock: Arc<dyn Clock> = Arc::new(VirtualClock::default());
+        let (rig, recorded) = replay::open(bundle, settings, clock.clone())
+            .map_err(|source| RigError::Replay { bundle: bundle.clone(), source })?;
+        return Ok(Families {
+            cameras: Some(Box::new(rig.cameras())),
+            projectors: Some(Box::new(rig.projectors())),
+            clock,
+            knows: Knowledge::Recorded(Box::new(recorded)),
+        });
+    }
+    let clock = Arc::new(MonotonicClock::start());
+    Ok(Families { cameras: None, projectors: None, clock, knows: Knowledge::Nothing })
+}
+
+fn truth_maps(truth: &sim::Truth) -> Truth {
+    let (width, height) = (truth.width, truth.height);
+    let grid = |values: &[f32]| Grid::from_vec(width, height, values.to_vec());
+    Truth {
+        column: grid(&truth.column),
+        row: grid(&truth.row),
+        depth_mm: grid(&truth.depth_mm),
+        object: Grid::from_vec(width, height, truth.object.clone()),
+        objects: truth
+            .objects
+            .iter()
+            .map(|object| TruthObject { name: object.name.clone(), planar: object.planar })
+            .collect(),
+    }
+}
