@@ -1,5 +1,5 @@
 # Two commands are all that is needed: `make run` and `make test`. Both install what is missing first.
-.PHONY: run test captures foreign-plane install ci
+.PHONY: run test captures foreign-plane fuzz install ci
 
 run: ## build, scan the simulated rig, say where the results are
 	@scripts/install build
@@ -16,6 +16,10 @@ captures: ## decode real captures made by others (POLSCAN_CAPTURES names their f
 foreign-plane: ## check the decoder from outside, with an independent numpy model
 	@scripts/install test
 	@scripts/foreign-plane
+
+fuzz: ## every parser with damaged input, 15 minutes each; scripts/fuzz SECONDS for less
+	@scripts/install build
+	@scripts/fuzz
 
 install: ## system packages and the Python environment of the checks
 	@scripts/install test

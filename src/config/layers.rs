@@ -9,12 +9,16 @@ use thiserror::Error;
 use toml::{Table, Value};
 
 use super::{Raw, Settings};
+use crate::store::{Policy, source::read_bounded};
 
 /// The commented defaults, which are also the manual.
 const DEFAULTS: &str = include_str!("../../config/default.toml");
 
 /// The shipped rig: values to go on with where `[sim]` has a fault.
 const TWIN: &str = include_str!("../../config/sim.toml");
+
+/// No configuration or scene is longer.
+const MAX_BYTES: u64 = 1 << 20;
 
 /// Bound on the faults that one configuration can report.
 const MOST_FAULTS: usize = 200;
@@ -113,13 +117,22 @@ pub struct Layers {
 impl Layers {
     /// Reads and joins all layers, or reports everything that is wrong with them.
     pub fn load(&self) -> Result<Settings, ConfigError> {
+        let folder = self.file.as_deref().and_then(Path::parent).unwrap_or(Path::new(""));
+        self.join(self.file.as_deref().map(read_table), folder)
+    }
+
+    /// The settings of a file's `text`, whose paths are relative to `folder`.
+    pub fn parse(text: &str, folder: &Path) -> Result<Settings, ConfigError> {
+        Self::default().join(Some(parse_table(text, None)), folder)
+    }
+
+    fn join(&self, file: Option<Result<Table, Fault>>, folder: &Path) -> Result<Settings, ConfigError> {
         let mut faults = Vec::new();
         let mut table = defaults();
-        if let Some(path) = &self.file {
-            match read_table(path) {
-                Ok(file) => merge(&mut table, file),
-                Err(fault) => faults.push(fault),
-            }
+        match file {
+            Some(Ok(file)) => merge(&mut table, file),
+            Some(Err(fault)) => faults.push(fault),
+            None => {}
         }
         for change in &self.overrides {
             // A serial number of digits only is text all the same.
@@ -132,7 +145,6 @@ impl Layers {
             }
         }
         let raw = self.deserialize(table, &mut faults);
-        let folder = self.file.as_deref().and_then(Path::parent).unwrap_or(Path::new(""));
         let settings = raw.and_then(|raw| {
             let mut found = Vec::new();
             let settings = Settings::validate(raw, folder, &mut found);
@@ -244,12 +256,25 @@ fn defaults() -> Table {
 
 fn read_table(path: &Path) -> Result<Table, Fault> {
     let origin = Some(path.display().to_string());
-    let text = std::fs::read_to_string(path).map_err(|error| Fault {
-        key: String::new(),
-        message: format!("cannot read the configuration file: {error}; give an existing file to --config"),
-        origin: origin.clone(),
-    })?;
-    toml::from_str(&text).map_err(|error| {
+    let text =
+        read_text(path).map_err(|message| Fault { key: String::new(), message, origin: origin.clone() })?;
+    parse_table(&text, origin)
+}
+
+/// The text of a regular file that is not longer than any configuration.
+pub(super) fn read_text(path: &Path) -> Result<String, String> {
+    let bytes =
+        read_bounded(path, Policy::Local, "read", MAX_BYTES).map_err(
+            |error| match std::error::Error::source(&error) {
+                Some(cause) => format!("{error}: {cause}"),
+                None => error.to_string(),
+            },
+        )?;
+    String::from_utf8(bytes).map_err(|_| format!("{} is not UTF-8 text", path.display()))
+}
+
+fn parse_table(text: &str, origin: Option<String>) -> Result<Table, Fault> {
+    toml::from_str(text).map_err(|error| {
         let line = error.span().map(|span| text[..span.start.min(text.len())].lines().count().max(1));
         let place = line.map(|line| format!("line {line}: ")).unwrap_or_default();
         Fault { key: String::new(), message: format!("not TOML: {place}{}", error.message()), origin }

@@ -8,7 +8,10 @@ use polscan_drivers::{
 };
 use polscan_patterns::{ChannelSet, Mode, Polarization};
 
-use super::raw::{self, DeviceDriver, Raw};
+use super::{
+    layers::read_text,
+    raw::{self, DeviceDriver, Raw},
+};
 use crate::decode::Thresholds;
 
 /// Where the calibration of the rig comes from.
@@ -223,10 +226,10 @@ fn sim(raw: &Raw, folder: &Path, faults: &mut Faults) -> Option<(RigDescription,
     };
     faults.extend(description.validate().into_iter().map(split_key));
     let path = folder.join(&description.scene);
-    let text = match std::fs::read_to_string(&path) {
+    let text = match read_text(&path) {
         Ok(text) => text,
-        Err(error) => {
-            faults.push(("sim.scene".into(), format!("cannot read {}: {error}", path.display())));
+        Err(message) => {
+            faults.push(("sim.scene".into(), message));
             return None;
         }
     };

@@ -55,6 +55,5 @@ fn sheet(results: &Results, maps: &Maps) -> image::RgbImage {
         depth_mm: results.outcome.reconstruction.is_some().then_some(&maps.depth_mm),
         class: &maps.class,
         projector: ProjectorSize { width: job.decode.column.size(), height: job.decode.row.size() },
-        cloud: None,
     })
 }

@@ -98,7 +98,7 @@ fn coverage(text: &mut Text, report: &Report) {
 fn capture(text: &mut Text, report: &Report) {
     let capture = &report.capture;
     if let (Some(seconds), Some(limit)) = (capture.seconds, capture.limit_seconds) {
-        let mut line = format!("{seconds:.2} s; the display allows no less than {limit:.2} s");
+        let mut line = format!("{seconds:.2} s; {} frames take {limit:.2} s at this hold", report.frames);
         if !capture.retaken.is_empty() {
             let _ = write!(line, "; {} of the pairs captured again", capture.retaken.len());
         }
@@ -259,7 +259,7 @@ verdict       ok
 scan          mode pse, 44 frames of 160 x 120 px
 coverage      100.0 % of 19 200 pixels with projector light were measured
 points        19 200
-capture       1.50 s; the display allows no less than 1.47 s
+capture       1.50 s; 44 frames take 1.47 s at this hold
 light check   1.00 x the camera's noise (ideal 1.00), worst 1.00: row bit 9
 drift         +0.00 % between the first and the last frames
 flatness      mm             points measured      rms     95 %      bow

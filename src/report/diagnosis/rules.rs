@@ -390,6 +390,8 @@ pub fn notes(input: &ReportInput, pixels: Option<&PixelCounts>) -> Vec<String> {
     }
     if input.reconstruction.is_none() {
         notes.push("no calibration, so no depth and no points".to_owned());
+    } else if decoded.row.is_none() {
+        notes.push("rows were not coded: `row` holds what column and calibration predict".to_owned());
     }
     if let Some(capture) = input.capture {
         if !capture.timing_measured {

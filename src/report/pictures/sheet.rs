@@ -50,8 +50,6 @@ pub struct OverviewInput<'a> {
     pub class: &'a Grid<u8>,
     /// Size of the projector.
     pub projector: ProjectorSize,
-    /// A view of the cloud, put below the maps.
-    pub cloud: Option<&'a RgbImage>,
 }
 
 /// One picture of the sheet: the map and what stands at its right.
@@ -80,19 +78,13 @@ pub fn overview(input: &OverviewInput<'_>) -> RgbImage {
     let rows = (tiles.len() as u32).div_ceil(columns);
     let heading = (4.4 * TITLE_HEIGHT) as u32;
     let width = columns * cell_width + GAP;
-    let cloud = input.cloud.map(|cloud| canvas::fit(cloud, width - 2 * GAP, width));
-    let below = cloud.as_ref().map_or(0, |cloud| cloud.height() + GAP);
-    let mut sheet = blank(width, heading + rows * cell_height + below, WHITE);
+    let mut sheet = blank(width, heading + rows * cell_height, WHITE);
     let ink = Ink { height: 1.4 * TITLE_HEIGHT, color: INK };
     text::draw(&mut sheet, input.title, (GAP as f32, 1.5 * TITLE_HEIGHT), ink);
     canvas::fill(&mut sheet, (GAP, (3.7 * TITLE_HEIGHT) as u32), (width - 2 * GAP, 1), FAINT);
     for (index, tile) in (0..).zip(&tiles) {
         let at = (GAP + index % columns * cell_width, heading + index / columns * cell_height);
         place(&mut sheet, tile, at, input.class);
-    }
-    if let Some(cloud) = cloud {
-        let x = (width - cloud.width()) / 2;
-        imageops::replace(&mut sheet, &cloud, i64::from(x), i64::from(heading + rows * cell_height));
     }
     sheet
 }
@@ -160,7 +152,6 @@ mod tests {
             depth_mm: Some(map),
             class,
             projector: ProjectorSize { width: 1024, height: 768 },
-            cloud: None,
         }
     }
 
@@ -179,9 +170,6 @@ mod tests {
         let fewer = overview(&OverviewInput { row: None, depth_mm: None, ..input(&red, &map, &class) });
         assert!(count(&fewer, Colormap::Jet.color(1.0)) >= area);
         assert!(count(&fewer, Colormap::Jet.color(1.0)) < 2 * area);
-        let blue = RgbImage::from_pixel(300, 100, image::Rgb([1, 2, 250]));
-        let with_cloud = overview(&OverviewInput { cloud: Some(&blue), ..input(&red, &map, &class) });
-        assert!(with_cloud.height() > all.height() && count(&with_cloud, [1, 2, 250]) >= 30_000);
     }
 
     #[test]
