@@ -30,11 +30,25 @@ pub(super) struct Line {
     pub start: usize,
     pub stride: usize,
     pub len: usize,
+    /// Its place among its neighbours.
+    pub number: usize,
+    /// Number of lines.
+    pub lines: usize,
+    /// From a pixel to its neighbour on the next line.
+    pub across: usize,
 }
 
 impl Line {
     pub fn at(self, position: usize) -> usize {
         self.start + position * self.stride
+    }
+
+    /// The pixel `y` lines and `t` pixels from the one at `position`; `None` beyond the image.
+    pub fn beside(self, position: usize, y: i32, t: i32) -> Option<usize> {
+        let number = self.number.checked_add_signed(y as isize).filter(|&number| number < self.lines)?;
+        let position = position.checked_add_signed(t as isize).filter(|&position| position < self.len)?;
+        let start = self.start + number * self.across - self.number * self.across;
+        Some(start + position * self.stride)
     }
 }
 
@@ -65,6 +79,8 @@ pub(super) enum EdgeForm {
     TwoPoint,
     /// Sum of partial areas over the pixels around the crossing: for sharp ones.
     PartialArea,
+    /// The partial-area method of Trujillo-Pino on three lines of the degree of polarization: mode paper.
+    ThreeLines,
 }
 
 impl EdgeForm {
@@ -91,11 +107,11 @@ pub(super) struct EdgeFinder<'a, T> {
     pub form: EdgeForm,
     /// Variance in px^2 that is added to each edge for what noise does not explain.
     pub floor: f64,
-    frames: &'a Frames<'a, T>,
-    bits: &'a [BitFrames<'a, T>],
+    pub(super) frames: &'a Frames<'a, T>,
+    pub(super) bits: &'a [BitFrames<'a, T>],
     values: &'a [i32],
     maps: &'a PixelMaps,
-    gates: &'a Gates,
+    pub(super) gates: &'a Gates,
     step: i32,
     /// Share of a pair's variance that the modulation has: its references' frames count inversely.
     modulation_share: f64,
@@ -169,22 +185,8 @@ impl<'a, T: Sample> EdgeFinder<'a, T> {
         Some((a, (variance + of_modulation) / (modulation * modulation)))
     }
 
-    fn mean(&self, planes: &[&[T]], at: usize) -> f64 {
+    pub(super) fn mean(&self, planes: &[&[T]], at: usize) -> f64 {
         planes.iter().map(|plane| f64::from(plane[at].dn())).sum::<f64>() / planes.len().max(1) as f64
-    }
-
-    /// Fringe of mode paper: difference of the degrees of linear polarization of pattern and inverse.
-    fn degree_fringe(&self, p: f32, q: f32, at: usize) -> (f64, f64) {
-        let dark = self.mean(&self.frames.low, at) as f32;
-        let difference = f64::from(self.gates.dolp(p, dark) - self.gates.dolp(q, dark));
-        let above_black = f64::from(dark - self.gates.black_dn).max(0.0);
-        let variance = |dn: f32| {
-            let sum = f64::from(dn - self.gates.black_dn) + above_black;
-            // d/dI (I - r) / (I + r) = 2 r / (I + r)^2.
-            let slope = if sum > 0.0 { 2.0 * above_black / (sum * sum) } else { 0.0 };
-            slope * slope * f64::from(self.gates.variance(dn))
-        };
-        (difference, (variance(p) + variance(q)).max(1e-9))
     }
 
     /// Slopes of the fringe at the crossings of coarse bits on a line.
@@ -253,6 +255,9 @@ impl<'a, T: Sample> EdgeFinder<'a, T> {
             let (place, variance) = match self.form {
                 EdgeForm::TwoPoint => two_point,
                 EdgeForm::PartialArea => self.partial_area(line, position, value, bit).unwrap_or(two_point),
+                EdgeForm::ThreeLines => {
+                    self.three_lines(line, position, two_point.0, (value, bit)).unwrap_or(two_point)
+                }
             };
             let u = self.code.boundary(value);
             edges.push(Edge { position: place, weight: 1.0 / (variance + self.floor), u, rising: to > from });

@@ -6,9 +6,12 @@
 //! nearby, missing low bits) keep the centre of their code's span with the standard deviation of a uniform
 //! distribution over it, as does a pixel whose fit contradicts its code.
 
+mod area;
+mod degree;
 mod edges;
 mod fit;
 
+use polscan_patterns::Mode;
 use rayon::prelude::*;
 
 use self::{
@@ -64,8 +67,8 @@ pub(crate) fn refine<T: Sample>(
     let code = frames.axes[index].code;
     let (lines, len) = if shape.along_y { (width, height) } else { (height, width) };
     let line = |number: usize| match shape.along_y {
-        true => Line { start: number, stride: width, len: height },
-        false => Line { start: number * width, stride: 1, len: width },
+        true => Line { start: number, stride: width, len: height, number, lines, across: 1 },
+        false => Line { start: number * width, stride: 1, len: width, number, lines, across: width },
     };
     let mut coordinate = vec![f32::NAN; width * height];
     let mut sigma = vec![f32::NAN; width * height];
@@ -121,7 +124,10 @@ fn calibrate<T: Sample>(finder: &mut EdgeFinder<'_, T>, lines: usize, line: impl
     for number in sampled.clone() {
         finder.coarse_slopes(line(number), &mut slopes);
     }
-    finder.form = EdgeForm::for_slopes(&mut slopes);
+    finder.form = match finder.gates.mode {
+        Mode::Paper => EdgeForm::ThreeLines,
+        _ => EdgeForm::for_slopes(&mut slopes),
+    };
     let mut scratch = Scratch::default();
     let mut triples = Vec::new();
     for number in sampled {
