@@ -1,12 +1,13 @@
 //! The command line: arguments in, exit code out. What the commands do lives in `commands`.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::{Args, Parser, Subcommand};
 use polscan_patterns::Mode;
 
 use crate::{
     commands,
+    compare::Method,
     config::{Layers, Override},
     engine::Failure,
     report::NamedRegion,
@@ -29,6 +30,8 @@ enum Command {
     Scan(Scan),
     /// Decode recorded frames, our own or foreign ones.
     Decode(Decode),
+    /// Compare the paper's method, ordinary Gray code and pse on one scene, as one page and one file of figures.
+    Compare(Compare),
     /// Write the pattern images as PNG, with the manifest that describes them.
     Patterns(Patterns),
     /// List cameras and projectors, usable or not.
@@ -87,6 +90,35 @@ struct Decode {
     /// Folder for the result; must be absent or empty.
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
+}
+
+#[derive(Debug, Args)]
+struct Compare {
+    #[command(flatten)]
+    config: ConfigArgs,
+    /// Recorded capture of ordinary Gray code.
+    #[arg(long, value_name = "BUNDLE", conflicts_with = "config")]
+    raw: Option<PathBuf>,
+    /// Recorded capture for the paper's method; one in mode pse will do as well.
+    #[arg(long, value_name = "BUNDLE", conflicts_with = "config")]
+    paper: Option<PathBuf>,
+    /// Recorded capture in mode pse.
+    #[arg(long, value_name = "BUNDLE", conflicts_with = "config")]
+    pse: Option<PathBuf>,
+    /// Rectangle of the camera image to measure as a plane, as NAME=x,y,width,height. May be repeated.
+    #[arg(long, value_name = "NAME=X,Y,W,H")]
+    region: Vec<NamedRegion>,
+    /// Folder for page and figures; must be absent or empty.
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+}
+
+impl Compare {
+    /// The bundles that were named.
+    fn bundles(&self) -> Vec<(Method, PathBuf)> {
+        let named = [(Method::Raw, &self.raw), (Method::Paper, &self.paper), (Method::Pse, &self.pse)];
+        named.into_iter().filter_map(|(method, path)| Some((method, path.clone()?))).collect()
+    }
 }
 
 #[derive(Debug, Args)]
@@ -168,6 +200,17 @@ fn dispatch(cli: &Cli) -> Result<u8, Failure> {
             out: &args.out,
             json: cli.json,
         }),
+        Command::Compare(args) => {
+            let bundles = args.bundles();
+            let what = match bundles.is_empty() {
+                true => commands::CompareArgs::Twin {
+                    settings: Box::new(layers(&args.config, Vec::new()).load()?),
+                    name: args.config.config.as_deref().unwrap_or(Path::new("")).display().to_string(),
+                },
+                false => commands::CompareArgs::Bundles(bundles),
+            };
+            commands::compare(&what, &args.region, &args.out, cli.json)
+        }
         Command::Patterns(args) => {
             let settings = layers(&args.config, Vec::new()).load()?;
             commands::patterns(&settings, args.mode, args.size, &args.out, cli.json)

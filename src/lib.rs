@@ -5,6 +5,7 @@ pub mod app;
 pub mod cli;
 pub mod cloud;
 pub mod commands;
+pub mod compare;
 pub mod config;
 pub mod decode;
 pub mod engine;

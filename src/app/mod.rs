@@ -12,6 +12,9 @@ use polscan_drivers::{
 use thiserror::Error;
 
 mod replay;
+mod twin;
+
+pub use twin::without_analyser;
 
 use crate::{
     config::{DeviceDriver, Settings},

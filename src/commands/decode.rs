@@ -16,6 +16,7 @@ use crate::{
         manifest::{Capture, Processing, Volume},
         source::{SensorPart, read_calibration_for},
     },
+    truth::Truth,
 };
 
 /// Volume of a capture that states none: no limit but that points lie in front of the camera.
@@ -41,51 +42,87 @@ pub struct DecodeArgs<'a> {
     pub json: bool,
 }
 
+/// A recorded bundle, read and checked.
+pub(super) struct Recorded {
+    pub(super) bundle: Bundle,
+    pub(super) frames: FrameSet,
+    sequence: Sequence,
+    calibration: Option<Calibration>,
+    regions: Vec<NamedRegion>,
+    processing: Processing,
+    pub(super) truth: Option<Truth>,
+    capture: Option<CaptureSummary>,
+    found: Vec<Reason>,
+    notes: Vec<String>,
+}
+
+impl Recorded {
+    /// Reads frames, calibration and truth of `bundle`; regions of the command line come before the bundle's.
+    pub(super) fn read(args: &DecodeArgs, bundle: Bundle) -> Result<Self, Failure> {
+        let failed = |error: Box<dyn std::error::Error + Send + Sync>| Failure::data(operation(args), error);
+        let frames = bundle.frames(&Limits::default()).map_err(|e| failed(e.into()))?;
+        let unlike = bundle.verify(&frames).map_err(|e| failed(e.into()))?;
+        let (sequence, calibration) = resolve(args, &bundle, &frames).map_err(failed)?;
+        let manifest = bundle.manifest();
+        let processing = manifest.processing.clone().unwrap_or_default();
+        let regions =
+            if args.regions.is_empty() { processing.regions.clone() } else { args.regions.to_vec() };
+        check_regions(&regions, (frames.width, frames.height)).map_err(|e| failed(e.into()))?;
+        let truth = bundle.truth((frames.width, frames.height)).map_err(|e| failed(e.into()))?;
+        let capture = manifest.capture.as_ref().map(|capture| summary(&manifest.sequence, capture));
+        let notes = bundle.notes().iter().chain(&frames.notes).chain(&unlike).cloned().collect();
+        let found = manifest.capture.iter().flat_map(found).collect();
+        Ok(Self { frames, sequence, calibration, regions, processing, truth, capture, found, notes, bundle })
+    }
+
+    /// What is decoded, and how.
+    pub(super) fn job(&self) -> Job<'_> {
+        let volume = self.processing.volume.unwrap_or(UNBOUNDED);
+        let size = (self.frames.width, self.frames.height);
+        Job {
+            roles: &self.sequence.roles,
+            planes: &self.frames.planes,
+            decode: self.bundle.manifest().decode_settings(&self.sequence, size, self.frames.sample_bits),
+            calibration: self.calibration.as_ref(),
+            reconstruct: ReconstructSettings {
+                near_mm: volume.near_mm,
+                far_mm: volume.far_mm,
+                row_gate_px: self.processing.row_gate_px,
+            },
+        }
+    }
+
+    /// What the report says besides.
+    pub(super) fn context(&self) -> Context<'_> {
+        let rig = self.bundle.manifest().rig.as_ref();
+        Context {
+            truth: self.truth.as_ref(),
+            capture: self.capture.as_ref(),
+            found: &self.found,
+            regions: &self.regions,
+            simulated: self.truth.is_some() || rig.is_some_and(|rig| rig.camera.driver == "sim"),
+            notes: &self.notes,
+        }
+    }
+}
+
+fn operation(args: &DecodeArgs) -> String {
+    format!("decode {}", args.bundle.display())
+}
+
 /// Decodes and writes; returns the exit code.
 pub fn decode(args: &DecodeArgs) -> Result<u8, Failure> {
     let start = Instant::now();
-    let operation = || format!("decode {}", args.bundle.display());
     let bundle =
-        Bundle::open(args.bundle, Policy::Local, args.mode).map_err(|e| Failure::data(operation(), e))?;
+        Bundle::open(args.bundle, Policy::Local, args.mode).map_err(|e| Failure::data(operation(args), e))?;
     // Refused before the work rather than after it.
     let writer = BundleWriter::create(args.out, Some(bundle.folder()), 0)
         .map_err(|error| Failure::storage("write the result", error))?;
-    let frames = bundle.frames(&Limits::default()).map_err(|e| Failure::data(operation(), e))?;
-    let unlike = bundle.verify(&frames).map_err(|e| Failure::data(operation(), e))?;
+    let recorded = Recorded::read(args, bundle)?;
     let load_ms = start.elapsed().as_secs_f64() * 1e3;
-
-    let (sequence, calibration) =
-        resolve(args, &bundle, &frames).map_err(|e| Failure::data(operation(), e))?;
-    let manifest = bundle.manifest();
-    let processing = manifest.processing.clone().unwrap_or_default();
-    let regions = if args.regions.is_empty() { processing.regions.clone() } else { args.regions.to_vec() };
-    check_regions(&regions, (frames.width, frames.height)).map_err(|e| Failure::data(operation(), e))?;
-    let volume = processing.volume.unwrap_or(UNBOUNDED);
-    let job = Job {
-        roles: &sequence.roles,
-        planes: &frames.planes,
-        decode: manifest.decode_settings(&sequence, (frames.width, frames.height), frames.sample_bits),
-        calibration: calibration.as_ref(),
-        reconstruct: ReconstructSettings {
-            near_mm: volume.near_mm,
-            far_mm: volume.far_mm,
-            row_gate_px: processing.row_gate_px,
-        },
-    };
-    let outcome = pipeline::run(&job).map_err(|error: PipelineError| Failure::data(operation(), error))?;
-
-    let truth = bundle.truth((frames.width, frames.height)).map_err(|e| Failure::data(operation(), e))?;
-    let capture = manifest.capture.as_ref().map(|capture| summary(&manifest.sequence, capture));
-    let notes: Vec<String> = bundle.notes().iter().chain(&frames.notes).chain(&unlike).cloned().collect();
-    let found: Vec<Reason> = manifest.capture.iter().flat_map(found).collect();
-    let context = Context {
-        truth: truth.as_ref(),
-        capture: capture.as_ref(),
-        found: &found,
-        regions: &regions,
-        simulated: truth.is_some() || manifest.rig.as_ref().is_some_and(|rig| rig.camera.driver == "sim"),
-        notes: &notes,
-    };
+    let (job, context) = (recorded.job(), recorded.context());
+    let outcome =
+        pipeline::run(&job).map_err(|error: PipelineError| Failure::data(operation(args), error))?;
     let results = Results {
         job: &job,
         outcome: &outcome,
@@ -93,18 +130,20 @@ pub fn decode(args: &DecodeArgs) -> Result<u8, Failure> {
         timings: Timings { load: Some(load_ms), ..outcome.timings },
         frames: None,
     };
-    let mut result = Manifest::new(&sequence, bundle.absolute_frames());
+    let (bundle, manifest) = (&recorded.bundle, recorded.bundle.manifest());
+    let mut result = Manifest::new(&recorded.sequence, bundle.absolute_frames());
     result.id = Some(engine::new_id());
     result.label = manifest.label.clone();
     result.tags = manifest.tags.clone();
     result.rig = manifest.rig.clone();
     if let Some(rig) = &mut result.rig {
-        rig.calibration_id = calibration.as_ref().map(Calibration::id);
+        rig.calibration_id = recorded.calibration.as_ref().map(Calibration::id);
     }
     result.settings = manifest.settings.clone();
     result.capture = manifest.capture.clone();
-    result.source = Some(bundle.origin(&frames));
-    result.processing = Some(Processing { regions: regions.clone(), ..processing });
+    result.source = Some(bundle.origin(&recorded.frames));
+    let regions = recorded.regions.clone();
+    result.processing = Some(Processing { regions, ..recorded.processing.clone() });
     let report = engine::write(writer, result, &results)?;
     Ok(print_result(&report, args.out, args.json))
 }

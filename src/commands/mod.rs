@@ -1,6 +1,7 @@
 //! What each command of the program does: reads, calls the pure parts, writes, prints.
 
 mod check_config;
+mod compare;
 mod decode;
 mod devices;
 mod failure;
@@ -13,6 +14,7 @@ use std::{io::Write, path::Path};
 use crate::report::{self, Outputs, Report, Verdict};
 
 pub use check_config::check_config;
+pub use compare::{CompareArgs, compare};
 pub use decode::{DecodeArgs, decode};
 pub use devices::devices;
 pub use failure::{USAGE, exit_code, print_failure, print_usage};

@@ -39,7 +39,7 @@ pub fn scan(settings: &Settings, regions: &[NamedRegion], out: &Path, json: bool
 }
 
 /// An interrupt from the terminal cancels the capture, which leaves the projector black. A second one ends the program.
-fn cancel_on_interrupt(cancel: &CancelFlag) {
+pub(super) fn cancel_on_interrupt(cancel: &CancelFlag) {
     let cancel = cancel.clone();
     let installed = ctrlc::set_handler(move || {
         if cancel.is_cancelled() {

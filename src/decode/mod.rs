@@ -5,6 +5,7 @@
 
 mod accumulate;
 mod contrast;
+mod edge_image;
 mod gates;
 mod kernels;
 mod limits;
@@ -20,6 +21,7 @@ mod words;
 
 pub use accumulate::Accumulator;
 pub use contrast::{Contrast, contrast};
+pub use edge_image::{ImageEdge, edges_of_image};
 pub use gates::BoundaryCheck;
 pub use pair_sum::{PairContext, estimate_noise, pair_residual};
 pub use types::{

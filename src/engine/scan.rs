@@ -6,7 +6,7 @@ use polscan_drivers::{
     camera::{AppliedSettings, CameraInfo},
     projector::ProjectorInfo,
 };
-use polscan_patterns::{ProjectorSize, Sequence};
+use polscan_patterns::{ProjectorSize, Role, Sequence};
 
 use super::{
     Failure,
@@ -18,7 +18,7 @@ use crate::{
     config::Settings,
     decode::{Accumulator, CameraResponse, DecodeSettings, NoiseModel, SharedPlane},
     geometry::{Calibration, ReadHints},
-    pipeline::{self, Context, Job},
+    pipeline::{self, Context, Job, PipelineError},
     report::{
         self, CaptureSummary, Diagnosis, NamedRegion, Reason, Report, ReportInput, Size, check_regions,
     },
@@ -78,9 +78,45 @@ impl Taken {
         self.failure.as_ref()
     }
 
+    /// What the rig knows of its scene, for a simulated one.
+    pub fn truth(&self) -> Option<&Truth> {
+        self.truth.as_ref()
+    }
+
     /// How the capture went.
     pub fn record(&self) -> &CaptureRecord {
         &self.record
+    }
+}
+
+/// The frames of a capture as the decoder takes them, and what the capture says of itself.
+struct TakenFrames {
+    roles: Vec<Role>,
+    planes: Vec<SharedPlane>,
+    summary: CaptureSummary,
+    found: Vec<Reason>,
+}
+
+impl TakenFrames {
+    fn new(taken: &Taken) -> Self {
+        let frames = &taken.record.frames;
+        Self {
+            roles: frames.iter().map(|captured| captured.role).collect(),
+            planes: frames.iter().map(|captured| shared_plane(&captured.frame)).collect(),
+            summary: CaptureSummary::from(&taken.record),
+            found: taken.record.notes.findings.iter().map(Reason::from).collect(),
+        }
+    }
+
+    fn context<'a>(&'a self, scan: &'a Scan, taken: &'a Taken) -> Context<'a> {
+        Context {
+            truth: taken.truth.as_ref(),
+            capture: Some(&self.summary),
+            found: &self.found,
+            regions: &scan.regions,
+            simulated: scan.simulated,
+            notes: &[],
+        }
     }
 }
 
@@ -177,16 +213,8 @@ impl Scan {
         if let Some(reason) = &taken.failure {
             return self.keep(taken, reason.clone(), manifest, writer);
         }
-        let frames = &taken.record.frames;
-        let roles: Vec<_> = frames.iter().map(|captured| captured.role).collect();
-        let planes: Vec<SharedPlane> = frames.iter().map(|captured| shared_plane(&captured.frame)).collect();
-        let job = Job {
-            roles: &roles,
-            planes: &planes,
-            decode: self.decode.clone(),
-            calibration: self.calibration.as_ref(),
-            reconstruct: self.reconstruct,
-        };
+        let frames = TakenFrames::new(taken);
+        let job = self.job(&frames);
         let outcome = match pipeline::run(&job) {
             Ok(outcome) => outcome,
             Err(error) => {
@@ -195,24 +223,38 @@ impl Scan {
                 return self.keep(taken, reason, manifest, writer);
             }
         };
-        let summary = CaptureSummary::from(&taken.record);
-        let found: Vec<Reason> = taken.record.notes.findings.iter().map(Reason::from).collect();
-        let context = Context {
-            truth: taken.truth.as_ref(),
-            capture: Some(&summary),
-            found: &found,
-            regions: &self.regions,
-            simulated: self.simulated,
-            notes: &[],
-        };
+        let context = frames.context(self, taken);
         let results = Results {
             job: &job,
             outcome: &outcome,
             context: &context,
             timings: outcome.timings,
-            frames: Some(&planes),
+            frames: Some(&frames.planes),
         };
         results::write(writer, manifest, &results)
+    }
+
+    /// Decodes what was taken and looks at it, without writing anything.
+    ///
+    /// # Errors
+    /// Where the frames cannot be decoded.
+    pub fn examine<R>(&self, taken: &Taken, look: impl FnOnce(&Results) -> R) -> Result<R, PipelineError> {
+        let frames = TakenFrames::new(taken);
+        let job = self.job(&frames);
+        let outcome = pipeline::run(&job)?;
+        let context = frames.context(self, taken);
+        let (timings, frames) = (outcome.timings, Some(&frames.planes[..]));
+        Ok(look(&Results { job: &job, outcome: &outcome, context: &context, timings, frames }))
+    }
+
+    fn job<'a>(&'a self, frames: &'a TakenFrames) -> Job<'a> {
+        Job {
+            roles: &frames.roles,
+            planes: &frames.planes,
+            decode: self.decode.clone(),
+            calibration: self.calibration.as_ref(),
+            reconstruct: self.reconstruct,
+        }
     }
 
     fn manifest(&self, label: Label) -> Manifest {

@@ -17,7 +17,7 @@
 //! A and B are the levels beside it.
 
 /// Longest reach of a window from its middle pixel along the lines.
-pub(super) const MAX_REACH: usize = 4;
+pub(in crate::decode) const MAX_REACH: usize = 4;
 /// Lines of a window.
 const LINES: usize = 3;
 /// Pixels of a line, with one more at each end for smoothing.
@@ -25,7 +25,7 @@ const SIDE: usize = 2 * MAX_REACH + 3;
 
 /// Shape of the edge.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Order {
+pub(in crate::decode) enum Order {
     /// Straight.
     First,
     /// A parabola, which curved edges and silhouettes need.
@@ -34,7 +34,7 @@ pub(super) enum Order {
 
 /// What is asked of a window.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Form {
+pub(in crate::decode) struct Form {
     pub order: Order,
     /// Whether the image is first averaged over 3x3 pixels, as the method does with noisy ones.
     pub smoothed: bool,
@@ -62,8 +62,10 @@ impl Form {
 
 /// An edge `t = position + slope y + curvature y^2` about the middle of a window, t along the lines, in px.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct AreaEdge {
+pub(in crate::decode) struct AreaEdge {
     pub position: f64,
+    /// The position of first order, whatever was asked for.
+    pub of_first_order: f64,
     /// In px per line.
     pub slope: f64,
     /// Coefficient of the square, half the second derivative.
@@ -76,9 +78,9 @@ pub(super) struct AreaEdge {
     pub variance: f64,
 }
 
-/// Values, variances and the weights with which they enter the position.
+/// Values and variances around the middle, and the values of the (smoothed) image.
 struct Window {
-    values: [[f64; SIDE]; LINES + 2],
+    image: [[f64; SIDE]; LINES + 2],
     variances: [[f64; SIDE]; LINES + 2],
 }
 
@@ -88,24 +90,28 @@ const MIDDLE_LINE: i32 = (LINES as i32 + 2) / 2;
 
 impl Window {
     fn read(form: Form, sample: &mut impl FnMut(i32, i32) -> Option<(f64, f64)>) -> Option<Self> {
-        let mut window = Self { values: [[0.0; SIDE]; LINES + 2], variances: [[0.0; SIDE]; LINES + 2] };
+        let mut values = [[0.0; SIDE]; LINES + 2];
+        let mut variances = values;
         for (y, t) in form.pixels() {
-            let (value, variance) = sample(y, t)?;
             let (line, at) = ((y + MIDDLE_LINE) as usize, (t + MIDDLE) as usize);
-            window.values[line][at] = value;
-            window.variances[line][at] = variance;
+            (values[line][at], variances[line][at]) = sample(y, t)?;
         }
-        Some(window)
+        let mut image = values;
+        if form.smoothed {
+            for line in 1..=LINES {
+                let sum: [f64; SIDE] =
+                    std::array::from_fn(|at| values[line - 1][at] + values[line][at] + values[line + 1][at]);
+                for at in 1..SIDE - 1 {
+                    image[line][at] = (sum[at - 1] + sum[at] + sum[at + 1]) / 9.0;
+                }
+            }
+        }
+        Some(Self { image, variances })
     }
 
     /// Value of the (smoothed) image.
-    fn at(&self, smoothed: bool, y: i32, t: i32) -> f64 {
-        let value = |y: i32, t: i32| self.values[(y + MIDDLE_LINE) as usize][(t + MIDDLE) as usize];
-        if !smoothed {
-            return value(y, t);
-        }
-        let near = (-1..=1).flat_map(|dy| (-1..=1).map(move |dt| (dy, dt)));
-        near.map(|(dy, dt)| value(y + dy, t + dt)).sum::<f64>() / 9.0
+    fn at(&self, y: i32, t: i32) -> f64 {
+        self.image[(y + MIDDLE_LINE) as usize][(t + MIDDLE) as usize]
     }
 }
 
@@ -117,22 +123,45 @@ fn level_pixels(form: Form, slope: f64) -> [[(i32, i32); 2]; 2] {
     [[(0, -before), (side, -form.ends(side)[0])], [(0, behind), (-side, form.ends(-side)[1])]]
 }
 
+/// How far the window of the pixel in the middle reaches: on each line and to each side as long as the change from pixel to
+/// pixel falls and keeps its sign, up to [`MAX_REACH`]. `value(y, t)` is the smoothed image.
+pub(in crate::decode) fn reach(value: impl Fn(i32, i32) -> Option<f64>) -> Option<[[usize; 2]; LINES]> {
+    let one = |line: i32, way: i32| {
+        let value = |t: usize| value(line, way * t as i32);
+        let mut last = value(1)? - value(0)?;
+        let mut reach = 1;
+        while reach < MAX_REACH {
+            let Some(next) = value(reach + 1).zip(value(reach)).map(|(a, b)| a - b) else { break };
+            if next * last <= 0.0 || (reach > 1 && next.abs() >= last.abs()) {
+                break;
+            }
+            last = next;
+            reach += 1;
+        }
+        Some(reach)
+    };
+    let line = |y| Some([one(y, -1)?, one(y, 1)?]);
+    Some([line(-1)?, line(0)?, line(1)?])
+}
+
 /// Finds the edge that runs across the lines near the middle of a window. `sample(y, t)` gives value and variance of the
 /// pixel `y` lines and `t` pixels from the middle one. `None` where a sample is missing or the levels are equal.
-pub(super) fn locate(form: Form, mut sample: impl FnMut(i32, i32) -> Option<(f64, f64)>) -> Option<AreaEdge> {
+pub(in crate::decode) fn locate(
+    form: Form,
+    mut sample: impl FnMut(i32, i32) -> Option<(f64, f64)>,
+) -> Option<AreaEdge> {
     let window = Window::read(form, &mut sample)?;
     let line = |y: i32| -form.ends(y)[0]..=form.ends(y)[1];
-    let sums = [-1, 0, 1].map(|y| line(y).map(|t| window.at(form.smoothed, y, t)).sum::<f64>());
+    let sums = [-1, 0, 1].map(|y| line(y).map(|t| window.at(y, t)).sum::<f64>());
     let counts = [-1, 0, 1].map(|y| line(y).count() as f64);
     // Which way it leans follows from the levels that it leans between, but these from that: the ends will do.
-    let [low, high] = [-form.ends(0)[0], form.ends(0)[1]].map(|t| window.at(form.smoothed, 0, t));
+    let [low, high] = [-form.ends(0)[0], form.ends(0)[1]].map(|t| window.at(0, t));
     let place = |y: usize, before: f64, after: f64| {
         (sums[y] - counts[y] * after) / (before - after) - form.reach[y][0] as f64 - 0.5
     };
     let slope = place(2, low, high) - place(0, low, high);
     let sets = level_pixels(form, slope);
-    let [before, after] =
-        sets.map(|set| set.iter().map(|&(y, t)| window.at(form.smoothed, y, t)).sum::<f64>() / 2.0);
+    let [before, after] = sets.map(|set| set.iter().map(|&(y, t)| window.at(y, t)).sum::<f64>() / 2.0);
     let step = before - after;
     if step == 0.0 || !step.is_finite() {
         return None;
@@ -155,7 +184,7 @@ pub(super) fn locate(form: Form, mut sample: impl FnMut(i32, i32) -> Option<(f64
     let lengths = [length, weighed(counts) - length];
     let variance = variance(form, &window, &sets, of_line, lengths) / (step * step);
     let slope = (offsets[2] - offsets[0]) / 2.0;
-    Some(AreaEdge { position, slope, curvature, before, after, variance })
+    Some(AreaEdge { position, of_first_order: offsets[1], slope, curvature, before, after, variance })
 }
 
 /// Variance of `position * (A - B)`: the position falls by the length before the edge over `A - B` per level of A, and by

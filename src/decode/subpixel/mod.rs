@@ -6,7 +6,7 @@
 //! nearby, missing low bits) keep the centre of their code's span with the standard deviation of a uniform
 //! distribution over it, as does a pixel whose fit contradicts its code.
 
-mod area;
+pub(super) mod area;
 mod degree;
 mod edges;
 mod fit;

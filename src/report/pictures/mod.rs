@@ -7,7 +7,7 @@ mod canvas;
 mod maps;
 mod sheet;
 mod text;
-mod ticks;
+pub(crate) mod ticks;
 mod view;
 
 pub use maps::{

@@ -23,6 +23,12 @@ pub(super) fn ticks(low: f32, high: f32, wanted: usize) -> (Vec<f32>, usize) {
     (values, decimals)
 }
 
+/// [`ticks`] with their labels.
+pub(crate) fn labelled(low: f64, high: f64, wanted: usize) -> Vec<(f64, String)> {
+    let (values, decimals) = ticks(low as f32, high as f32, wanted);
+    values.into_iter().map(|value| (f64::from(value), label(value, decimals))).collect()
+}
+
 fn is_whole(value: f64) -> bool {
     (value - value.round()).abs() < 1e-6 * value.abs().max(1.0)
 }

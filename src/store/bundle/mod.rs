@@ -186,12 +186,7 @@ impl BundleWriter {
         let names: BTreeSet<&str> = written.iter().map(|file| file.name.as_str()).collect();
         check(&manifest, &names, frames)?;
         manifest.files = written.into_par_iter().map(Written::seal).collect::<Result<_, _>>()?;
-        let sync = |folder: &Path| {
-            self.disk.sync_folder(folder).map_err(|error| StorageError::file("sync folder", folder, error))
-        };
-        for folder in &folders {
-            sync(folder)?;
-        }
+        self.sync(&folders)?;
         let json = manifest.to_json().map_err(|error| {
             StorageError::refused(manifest::FILE_NAME, format!("cannot be written: {error}"))
         })?;
@@ -203,6 +198,25 @@ impl BundleWriter {
         self.place.publish(&*self.disk)?;
         self.finished = true;
         Ok(manifest)
+    }
+
+    /// As [`BundleWriter::finish`] for a result that is no bundle and has no manifest.
+    pub fn finish_plain(mut self) -> Result<(), StorageError> {
+        let progress = self.progress.get_mut().unwrap_or_else(PoisonError::into_inner);
+        let Progress { written, folders, .. } = std::mem::take(progress);
+        written.into_par_iter().try_for_each(|file| file.seal().map(drop))?;
+        self.sync(&folders)?;
+        self.place.publish(&*self.disk)?;
+        self.finished = true;
+        Ok(())
+    }
+
+    /// Brings folders to the medium.
+    fn sync(&self, folders: &BTreeSet<PathBuf>) -> Result<(), StorageError> {
+        let sync = |folder: &PathBuf| {
+            self.disk.sync_folder(folder).map_err(|error| StorageError::file("sync folder", folder, error))
+        };
+        folders.iter().try_for_each(sync)
     }
 }
 
