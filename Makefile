@@ -1,5 +1,5 @@
 # Two commands are all that is needed: `make run` and `make test`. Both install what is missing first.
-.PHONY: run test captures foreign-plane fuzz install ci
+.PHONY: run test captures foreign-plane fuzz accuracy install ci
 
 run: ## build, scan the simulated rig, say where the results are
 	@scripts/install build
@@ -20,6 +20,10 @@ foreign-plane: ## check the decoder from outside, with an independent numpy mode
 fuzz: ## every parser with damaged input, 15 minutes each; scripts/fuzz SECONDS for less
 	@scripts/install build
 	@scripts/fuzz
+
+accuracy: ## measure the scanner on the simulated rig, about 5 minutes; writes docs/accuracy.md and its plots
+	@scripts/install build
+	cargo run --locked --profile test --example accuracy
 
 install: ## system packages and the Python environment of the checks
 	@scripts/install test

@@ -45,6 +45,9 @@ pub struct Measured {
     pub wedges: Vec<(Mode, Vec<Strip>)>,
     /// Position of single edges at reflectance 1 and 0.1, rms in projector px.
     pub edges: Vec<(f64, Option<f64>)>,
+    /// Decades down to which a pixel of the wedge reaches the lit gate of 4 sigma on the mean: with the rig's ambient
+    /// light, and without any.
+    pub range_limits: [f64; 2],
     /// The pinned scene, whole.
     pub pinned: polscan::report::Report,
 }
@@ -162,7 +165,8 @@ pub fn all(base: &Settings) -> Result<Measured, Box<dyn Error>> {
                 "Exposure",
                 "exposure, us",
                 true,
-                "At 4000 us and above the white plate saturates.",
+                "At 4000 us the white plate's H reference saturates, its edges can no longer be placed, and points fall \
+                 back to whole codes with a sigma that says so; at 8000 us nearly all its pairs saturate.",
             ),
             &[125.0, 250.0, 500.0, 1000.0, 2000.0, 4000.0, 8000.0],
             |settings, value| {
@@ -214,7 +218,9 @@ pub fn all(base: &Settings) -> Result<Measured, Box<dyn Error>> {
                 "Blur",
                 "blur of the projector lens, projector px (standard deviation)",
                 false,
-                "One projector pixel is three camera pixels wide here; the camera's own blur stays at 0.6 px.",
+                "One projector pixel is three camera pixels wide here; the camera's own blur stays at 0.6 px. Below 0.2 px \
+                 the twin is at its limit, not the decoder: it samples the projected picture at the middle of each camera \
+                 pixel, so that a perfectly sharp stripe edge is only known to a camera pixel, and no sigma can tell.",
             ),
             &[0.0, 0.1, 0.2, 0.4, 0.6, 0.9, 1.2],
             |settings, value| {
@@ -274,14 +280,30 @@ pub fn all(base: &Settings) -> Result<Measured, Box<dyn Error>> {
             |_, level| sphere(level),
         )?,
     ];
-    Ok(Measured { sweeps, wedges, edges, pinned })
+    let ambient = rig(&mut base.clone())?.ambient.electrons;
+    let range_limits = [ambient, 0.0].map(|ambient| range_limit(base, ambient));
+    Ok(Measured { sweeps, wedges, edges, range_limits, pinned })
+}
+
+/// Extinction of the projector on the wedge.
+const WEDGE_EXTINCTION: f64 = 10.0;
+
+/// Decades from the brightest level down to the one where modulation equals 4 sigma of a pattern less its inverse:
+/// `(1 - 1/e) H = 4 sqrt((1 + 1/e) H + 2 ambient + 2 read^2)` in electrons.
+fn range_limit(base: &Settings, ambient: f64) -> f64 {
+    let Some((description, _)) = &base.sim else { return f64::NAN };
+    let (leak, gate) = (1.0 / WEDGE_EXTINCTION, 4.0);
+    let fixed = 2.0 * ambient + 2.0 * description.camera.read_noise_e.powi(2);
+    let (a, b, c) = ((1.0 - leak).powi(2), gate * gate * (1.0 + leak), gate * gate * fixed);
+    let least = (b + (b * b + 4.0 * a * c).sqrt()) / (2.0 * a);
+    (0.9 * description.camera.full_well_e / least).log10()
 }
 
 /// Strips of the wedge at extinction 10:1, over the whole sensor.
 fn wedge(base: &Settings, mode: Mode) -> Result<Vec<Strip>, Box<dyn Error>> {
     let mut settings = base.clone();
     settings.mode = mode;
-    rig(&mut settings)?.projector.extinction = [10.0; 3];
+    rig(&mut settings)?.projector.extinction = [WEDGE_EXTINCTION; 3];
     set_scene(&mut settings, include_str!("../../config/scenes/wedge.toml"))?;
     let report = report(&settings)?;
     let strip = |number: usize| Strip {

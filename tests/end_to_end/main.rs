@@ -2,6 +2,7 @@
 
 mod bad_input;
 mod captures_of_the_twin;
+mod compare;
 mod faults;
 mod patterns;
 mod refusals;
