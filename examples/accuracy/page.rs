@@ -258,7 +258,7 @@ fn section(page: &mut String, images: &Path, sweep: &Sweep) -> Result<(), Box<dy
     Ok(())
 }
 
-#[allow(clippy::too_many_arguments)]
+#[expect(clippy::too_many_arguments, reason = "a plot has that many parts")]
 fn plot(
     page: &mut String,
     images: &Path,

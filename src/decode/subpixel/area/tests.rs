@@ -162,7 +162,7 @@ struct Found {
 fn agrees_with_an_independent_implementation() {
     let text = include_str!("../../../../tests/fixtures/partial-area.json");
     let reference: Reference = serde_json::from_str(text).unwrap();
-    let (mut compared, mut by_chance) = (0, 0);
+    let (mut compared, mut by_chance, mut tossed) = (0, 0, 0);
     for case in &reference.cases {
         let name = format!("{} smoothed {} order {}", case.scene, case.smoothing, case.order);
         let mut missed = Vec::new();
@@ -192,16 +192,19 @@ fn agrees_with_an_independent_implementation() {
                 })
             };
             compared += 1;
-            // Which way an edge leans that hardly does is told by noise, and by another rule there than here.
-            if !agrees(place) && slope.abs() > 0.05 {
-                missed.push((column, row));
+            if !agrees(place) {
+                // Which way an edge leans that hardly does is told by noise, and by another rule there than here.
+                match slope.abs() < 0.1 && case.scene == "noisy-disc" {
+                    true => tossed += 1,
+                    false => missed.push((column, row)),
+                }
             }
             by_chance += u32::from(agrees(place + 0.01));
         }
         println!("{name}: {} edges, missed {missed:?}", case.edges.len());
         assert!(missed.is_empty(), "{name}: {missed:?}");
     }
-    assert!(compared > 600 && by_chance == 0, "{by_chance} of {compared}");
+    assert!(compared > 600 && by_chance == 0 && tossed <= 10, "{by_chance}, {tossed} of {compared}");
 }
 
 /// All reaches of the three lines up to the method's longest.
