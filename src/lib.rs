@@ -8,6 +8,7 @@ pub mod commands;
 pub mod config;
 pub mod decode;
 pub mod engine;
+mod evidence;
 pub mod geometry;
 pub mod grid;
 pub mod pipeline;

@@ -83,6 +83,7 @@ pub fn decode(args: &DecodeArgs) -> Result<u8, Failure> {
         capture: capture.as_ref(),
         found: &found,
         regions: &regions,
+        extinction_ratio: processing.extinction_ratio,
         simulated: truth.is_some() || manifest.rig.as_ref().is_some_and(|rig| rig.camera.driver == "sim"),
         notes: &notes,
     };
@@ -128,6 +129,8 @@ fn summary(sequence: &[Role], capture: &Capture) -> CaptureSummary {
         hold_frames: capture.hold_refreshes,
         timing_measured: capture.timing_measured,
         retaken: capture.retaken.clone(),
+        references_retaken: capture.notes.references_retaken.clone(),
+        discarded: capture.notes.discarded.clone(),
         statistics: capture.statistics,
         ..CaptureSummary::default()
     }

@@ -202,6 +202,7 @@ impl Scan {
             capture: Some(&summary),
             found: &found,
             regions: &self.regions,
+            extinction_ratio: self.settings.extinction_ratio(),
             simulated: self.simulated,
             notes: &[],
         };
@@ -227,6 +228,7 @@ impl Scan {
             volume: Some(Volume { near_mm, far_mm }),
             row_gate_px,
             regions: self.regions.clone(),
+            extinction_ratio: self.settings.extinction_ratio(),
         });
         manifest
     }

@@ -3,7 +3,7 @@
 //! The causes named here are the likely ones, as far as the statistics of one pair can tell; the evidence is written
 //! out beside each, so that a person can judge again.
 
-use polscan_drivers::frame::Frame;
+use polscan_drivers::frame::{Frame, Pixels};
 use polscan_patterns::{Axis, Role};
 use serde::{Deserialize, Serialize};
 
@@ -60,7 +60,10 @@ pub struct PairThresholds {
     pub stale_share: f64,
     /// Below this share of outliers something small moved.
     pub motion_share: f64,
-    /// From this proportional change between two frames of one reference on, they show different pictures.
+    /// From this loss or gain of brightness between two frames of one reference on, as a share, they show different
+    /// pictures: more than lamps and automatic exposures change, less than lies between the two references.
+    pub stale_loss: f64,
+    /// See `stale_loss`.
     pub stale_gain: f64,
     /// Share of edge pixels beyond 5 sigma that is called a non-linear response.
     pub edge_outliers: f64,
@@ -84,7 +87,8 @@ impl Default for PairThresholds {
             flat_outliers: 0.005,
             stale_share: 0.2,
             motion_share: 0.02,
-            stale_gain: 0.3,
+            stale_loss: 0.7,
+            stale_gain: 5.0,
             edge_outliers: 0.02,
             edge_ratio: 10.0,
             median_degraded: 1.0,
@@ -176,8 +180,18 @@ pub fn compare_references(
     camera: &CameraResponse,
     noise: NoiseModel,
 ) -> Option<ReferenceChange> {
-    let (before, after) = (first.pixels(), last.pixels());
-    if (first.width, first.height) != (last.width, last.height) || before.len() != after.len() {
+    let same = (first.width, first.height) == (last.width, last.height);
+    same.then(|| compare_pixels(first.pixels(), last.pixels(), camera, noise)).flatten()
+}
+
+/// The same for bare pixels.
+pub(crate) fn compare_pixels(
+    before: Pixels<'_>,
+    after: Pixels<'_>,
+    camera: &CameraResponse,
+    noise: NoiseModel,
+) -> Option<ReferenceChange> {
+    if before.len() != after.len() {
         return None;
     }
     let black = camera.black_level_dn.unwrap_or(0.0);
@@ -266,13 +280,14 @@ pub fn drift_rule(role: Role, change: &ReferenceChange, thresholds: &PairThresho
             "too few unsaturated pixels to compare",
         ));
     }
-    if change.outliers >= thresholds.stale_share || change.gain.abs() >= thresholds.stale_gain {
+    let another = change.gain <= -thresholds.stale_loss || change.gain >= thresholds.stale_gain;
+    if change.outliers >= thresholds.stale_share || another {
         return PairVerdict::Retake(suspicion(
             "stale-frame",
             "a large part of the image shows another picture",
         ));
     }
-    if change.outliers >= thresholds.flat_outliers {
+    if change.outliers >= thresholds.flat_outliers + 2.0 * normal_tails(5.0 / change.sigma.clamp(1.0, 3.0)) {
         return PairVerdict::Retake(suspicion("motion", "a part of the image changed during the scan"));
     }
     if change.median.abs() >= thresholds.median_degraded {
@@ -283,6 +298,11 @@ pub fn drift_rule(role: Role, change: &ReferenceChange, thresholds: &PairThresho
         });
     }
     PairVerdict::Accept
+}
+
+/// Share of normal numbers beyond `z` to either side, an upper bound (Mills' ratio); `z` is 1 or more.
+fn normal_tails(z: f64) -> f64 {
+    2.0 * (-0.5 * z * z).exp() / (z * std::f64::consts::TAU.sqrt())
 }
 
 #[cfg(test)]

@@ -88,7 +88,7 @@ fn frames() -> Vec<Case> {
         }),
         // In the order of arrival nothing is wrong with frames that are only late.
         case("late frame", &["lost-frame"], &["ok"], |rig, random| {
-            rig.fault(&at_frame("late-frame", ", by_ms = 250.0", random))
+            rig.fault(&at_frame("late-frame", ", by_ms = 1500.0", random))
         }),
         case("duplicate frame", &["stale-frame", "duplicate-frame"], &["stale-frame"], |rig, random| {
             rig.fault(&at_frame("duplicate-frame", "", random))

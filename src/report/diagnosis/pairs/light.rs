@@ -5,17 +5,52 @@ use serde_json::json;
 use super::{Case, View, all_evidence, names};
 use crate::{
     decode::Decoded,
+    evidence::Frames,
     report::{
-        diagnosis::{Diagnosis, Reason, look::Frames},
+        diagnosis::{Diagnosis, Reason},
         statistics,
     },
 };
+
+/// Whether the light of the frames goes up and down more than once over, or a few frames stand out from the rest. A lamp
+/// that warms up and automatic exposure go one way; where the references were exposed otherwise than all pairs, as
+/// automatic exposure does, no few frames stand out.
+fn is_to_and_fro(coarse: &[View], shifted: &[Case]) -> bool {
+    if shifted.iter().all(|case| case.look.is_none()) {
+        return true;
+    }
+    let mut changes = Vec::new();
+    for view in coarse {
+        let case = shifted.iter().find(|case| std::ptr::eq(case.view.pair, view.pair));
+        match case.and_then(|case| case.look.as_ref()) {
+            Some(look) if look.is_offset => changes.extend([look.change; 2]),
+            Some(look) => changes.extend(look.gains),
+            None => changes.extend([0.0; 2]),
+        }
+    }
+    if shifted.iter().any(|case| !coarse.iter().any(|view| std::ptr::eq(case.view.pair, view.pair))) {
+        // A single fine pair.
+        return true;
+    }
+    let (low, high) = changes.iter().fold((f64::MAX, f64::MIN), |(l, h), &c| (l.min(c), h.max(c)));
+    let range = high - low;
+    let travel: f64 = changes.windows(2).map(|two| (two[1] - two[0]).abs()).sum();
+    let middle = statistics::median(&mut changes.clone()).unwrap_or(0.0);
+    let odd = changes.iter().filter(|&&change| (change - middle).abs() > 0.5 * range).count();
+    let few = odd as f64 <= FEW_FRAMES * changes.len() as f64 && middle.abs() < 0.3 * range;
+    travel >= TRAVEL * range || few
+}
 
 /// Correlation of the shifts with the order of the pairs from which on they are a drift rather than a flicker.
 const TREND: f64 = 0.8;
 /// Difference of first and last references, as a share of the modulation, from which on it is a reason: it moves a stripe
 /// edge by about a third of the 0.05 px that an edge should be good for.
 const DRIFT: f64 = 0.02;
+/// How many times its range the light must travel from frame to frame for going to and fro: once over is 1, up and down
+/// again 2.
+const TRAVEL: f64 = 2.5;
+/// Share of the frames that are few.
+const FEW_FRAMES: f64 = 0.15;
 /// Share of the drift that the modulation must take part in for lamp or exposure to be its cause.
 const LAMP_SHARE: f64 = 0.5;
 
@@ -29,7 +64,9 @@ pub(super) fn brightness(
     let trend = trend(coarse);
     let drift = decoded.drift.and_then(statistics::finite);
     let drifted = drift.is_some_and(|drift| drift.abs() > DRIFT);
-    if drifted || (!shifted.is_empty() && trend.abs() >= TREND) {
+    let to_and_fro = !shifted.is_empty() && trend.abs() < TREND && is_to_and_fro(coarse, shifted);
+    let one_way = !shifted.is_empty() && (frames.is_some() || trend.abs() >= TREND);
+    if !to_and_fro && (drifted || one_way) {
         let modulation = frames.and_then(|frames| frames.modulation_drift());
         return Some(drift_reason(drift, modulation, trend, shifted));
     }
@@ -69,7 +106,13 @@ fn drift_reason(drift: Option<f64>, modulation: Option<f64>, trend: f64, shifted
     evidence["drift"] = json!(drift);
     evidence["modulation_drift"] = json!(modulation);
     evidence["trend"] = json!(trend);
-    let lamp = drift.zip(modulation).map(|(drift, modulation)| modulation.abs() >= LAMP_SHARE * drift.abs());
+    let offsets = shifted.iter().filter_map(|case| case.look.as_ref()).filter(|look| look.is_offset).count();
+    let lamp = match drift.zip(modulation).filter(|(drift, _)| drift.abs() > DRIFT) {
+        Some((drift, modulation)) => Some(modulation.abs() >= LAMP_SHARE * drift.abs()),
+        None if shifted.iter().all(|case| case.look.is_none()) => None,
+        // First and last references agree: what lies between them tells.
+        None => Some(2 * offsets < shifted.len()),
+    };
     if lamp == Some(false) {
         return Reason::degraded(
             Diagnosis::AmbientDrift,
