@@ -7,11 +7,11 @@ use polscan_drivers::frame::{Frame, PixelStore, Pixels};
 use polscan_patterns::{Axis, Role, Sequence};
 
 use crate::{
-    evidence::{self, Cause},
     decode::{
         CameraResponse, NoiseModel, PairContext, Plane, PlaneSource, SharedPlane, Thresholds, estimate_noise,
         pair_residual,
     },
+    evidence::{self, Cause},
     sequencer::{Judge, PairThresholds, PairVerdict, Suspicion, compare_references, drift_rule, judge_rule},
 };
 
@@ -196,6 +196,14 @@ impl PairSumJudge {
         }
     }
 
+    /// Whether two frames of a reference are as far apart as different pictures.
+    fn is_another(&self, first: &Frame, last: &Frame) -> bool {
+        let (Some([high, low]), Some(noise)) = (self.levels(), self.noise) else { return true };
+        let modulation = |at: usize| f64::from(high.pixels().get(at)) - f64::from(low.pixels().get(at));
+        let planes = [first, last].map(|frame| plane(frame.pixels()));
+        evidence::is_another_picture(planes, modulation, noise, self.camera.black_level_dn.unwrap_or(0.0))
+    }
+
     fn agree(&self, pair: &Pair, other: &Pair) -> bool {
         self.compare(pair, other).is_some_and(|verdict| verified(&verdict))
     }
@@ -328,7 +336,15 @@ impl Judge for PairSumJudge {
     fn drift(&mut self, role: Role, first: &Frame, last: &Frame) -> PairVerdict {
         let change = self.noise.and_then(|noise| compare_references(first, last, &self.camera, noise));
         match change {
-            Some(change) => drift_rule(role, &change, &self.limits),
+            Some(change) => match drift_rule(role, &change, &self.limits) {
+                PairVerdict::Retake(suspicion)
+                    if suspicion.reason == "stale-frame" && !self.is_another(first, last) =>
+                {
+                    // The next picture would carry the same rest.
+                    PairVerdict::Degraded(Suspicion { reason: "unsettled-display".into(), ..suspicion })
+                }
+                verdict => verdict,
+            },
             None => PairVerdict::Degraded(Suspicion {
                 reason: "unverified-reference".into(),
                 evidence: format!("{role}: too little light to compare it with the first"),

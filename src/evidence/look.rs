@@ -30,6 +30,8 @@ const ABLE_SIGMA: f64 = 8.0;
 /// the second is believed to be noise.
 const NOISY: f64 = 1.2;
 const NOISIEST: f64 = 6.0;
+/// Median difference of two frames of one picture, in sigma, at most: 0.67 by noise alone.
+const ALIKE_SIGMA: f64 = 2.0;
 /// About so many neighbours measure the noise.
 const NOISE_PAIRS: usize = 20_000;
 /// Fewer pixels than this show nothing.
@@ -87,6 +89,8 @@ pub struct Look {
     pub strength: Option<f64>,
     /// Robust spread of the same, as a share of it.
     pub strength_spread: Option<f64>,
+    /// Share of the outliers that have the more common sign.
+    pub one_sided: f64,
     /// First image row below a tear.
     pub torn_at: Option<usize>,
     /// Whether each pixel looked at is an unexplained outlier; the same pixels for all pairs, `None` where not judged.
@@ -94,6 +98,11 @@ pub struct Look {
 }
 
 impl Look {
+    /// Share of the pixels that a change of brightness, if it is no absurd one, does not explain.
+    pub fn disturbed(&self) -> f64 {
+        if self.change.abs() < LARGEST_CHANGE { self.unexplained } else { self.outliers }
+    }
+
     /// Whether the frames differ in brightness from the others, and by nothing else.
     pub fn is_brightness(&self) -> bool {
         self.unexplained <= 0.1 * self.outliers
@@ -126,16 +135,38 @@ impl<'a> Frames<'a> {
         self.all.iter().filter(|(role, _)| *role == wanted).map(|(_, plane)| *plane).collect()
     }
 
-    /// Bright and dark references, where there are both.
+    /// Whether two frames show the same picture, noise apart, on the lit pixels.
+    pub fn are_alike(&self, one: Plane<'a>, other: Plane<'a>) -> bool {
+        let class = self.decoded.class.data();
+        let black = self.decoded.black_level_dn;
+        let mut apart: Vec<f64> = (0..class.len())
+            .step_by((class.len() / NOISE_PAIRS).max(1))
+            .filter(|&at| usable(class[at]))
+            .map(|at| {
+                let levels = [sample(one, at), sample(other, at)].map(|dn| dn - black);
+                (levels[0] - levels[1]).abs()
+                    / (2.0 * self.decoded.noise.variance(levels[0].max(levels[1]))).sqrt()
+            })
+            .collect();
+        apart.len() >= LEAST_PIXELS && statistics::median(&mut apart).is_some_and(|apart| apart < ALIKE_SIGMA)
+    }
+
+    /// Bright and dark references that can be relied on, where there are both.
     pub fn references(&self) -> Option<[Vec<Plane<'a>>; 2]> {
+        let mut found = self.all_references()?;
+        if !self.last_references {
+            found.iter_mut().for_each(|planes| planes.truncate(1));
+        }
+        Some(found)
+    }
+
+    /// Bright and dark references, where there are both.
+    pub fn all_references(&self) -> Option<[Vec<Plane<'a>>; 2]> {
         let (bright, dark) = match self.settings.mode.is_polarized() {
             true => (Role::ReferenceH, Role::ReferenceV),
             false => (Role::White, Role::Black),
         };
-        let mut found = [self.of(bright), self.of(dark)];
-        if !self.last_references {
-            found.iter_mut().for_each(|planes| planes.truncate(1));
-        }
+        let found = [self.of(bright), self.of(dark)];
         found.iter().all(|planes| !planes.is_empty()).then_some(found)
     }
 
@@ -373,6 +404,11 @@ impl Sampler<'_> {
         let strengths =
             outliers.filter_map(|pixel| statistics::finite((pixel.residual / pixel.modulation).abs()));
         let mut strengths: Vec<f64> = strengths.collect();
+        let brighter =
+            seen.iter().filter(|pixel| pixel.is_outlier(Change::NONE, unit) && pixel.residual > 0.0).count()
+                as f64;
+        let count = strengths.len().max(1) as f64;
+        let one_sided = brighter.max(count - brighter) / count;
         let strength = statistics::median(&mut strengths);
         let strength_spread = statistics::robust_sigma(&mut strengths)
             .zip(strength)
@@ -409,6 +445,7 @@ impl Sampler<'_> {
             },
             strength,
             strength_spread,
+            one_sided,
             torn_at: tear(&by_row).map(|row| rows[row]),
             marks,
         })

@@ -3,7 +3,10 @@
 
 mod look;
 
-use crate::decode::PairResidual;
+use crate::{
+    decode::{NoiseModel, PairResidual, Plane},
+    report::statistics,
+};
 
 pub use look::{Frames, Look, Pair, sample};
 
@@ -18,6 +21,12 @@ pub const CHANGE: f64 = 0.02;
 pub const EDGE_OUTLIERS: f64 = 0.01;
 /// Residual as a share of the modulation from which on a frame shows another picture (1 is the ideal), not a rest of it.
 pub const STALE_SHARE: f64 = 0.5;
+/// The same for a reference, beside which other pictures may be the finest stripes, blurred to a part of it.
+const ANOTHER_REFERENCE: f64 = 0.35;
+/// Range of the same within which it is the modulation itself.
+const ANOTHER: [f64; 2] = [0.75, 1.3];
+/// Share of the outliers with one sign from which on they are one-sided.
+const ONE_SIDED: f64 = 0.9;
 /// Outliers of a pair from which on a whole frame is wrong. A frame that shows another pattern is wrong on a half of
 /// the pixels or more.
 pub const WHOLE_FRAME: f64 = 0.15;
@@ -35,6 +44,28 @@ pub fn worst_pair(pairs: &[PairResidual]) -> Option<&PairResidual> {
         (flat / FLAT_OUTLIERS).max(edge / EDGE_OUTLIERS).max(spread / 0.25).max(shift)
     };
     pairs.iter().filter(|pair| odd(pair) > 1.0).max_by(|a, b| odd(a).total_cmp(&odd(b)))
+}
+
+/// Whether the change from one frame of a reference to another is as large as between different pictures: the median of
+/// what changed beyond 5 sigma, as a share of the modulation. A display that has not settled leaves less.
+pub fn is_another_picture(
+    [first, last]: [Plane<'_>; 2],
+    modulation: impl Fn(usize) -> f64,
+    noise: NoiseModel,
+    black_dn: f64,
+) -> bool {
+    let step = (first.len() / 50_000).max(1);
+    let mut shares: Vec<f64> = (0..first.len().min(last.len()))
+        .step_by(step)
+        .filter_map(|at| {
+            let [before, after] = [sample(first, at) - black_dn, sample(last, at) - black_dn];
+            let sigma = (2.0 * noise.variance(before.max(after))).sqrt();
+            let modulation = modulation(at).abs();
+            let seen = (after - before).abs() > 5.0 * sigma && modulation > 8.0 * sigma;
+            seen.then(|| (after - before).abs() / modulation)
+        })
+        .collect();
+    statistics::median(&mut shares).is_none_or(|share| share >= ANOTHER_REFERENCE)
 }
 
 /// What is wrong with one pair, as far as the pair alone can tell.
@@ -96,20 +127,24 @@ impl Look {
                 (true, true) => Cause::Room,
             };
         }
-        if self.unexplained <= FLAT_OUTLIERS {
+        if self.disturbed() <= FLAT_OUTLIERS {
             return Cause::Nothing;
         }
         let strength = self.strength.unwrap_or(1.0);
-        if let Some(row) = self.torn_at.filter(|_| strength >= STALE_SHARE) {
+        let spread = self.strength_spread.unwrap_or(0.0);
+        // Another picture is off by the whole modulation; by more where the references are other pictures, too.
+        let is_another = strength > ANOTHER[1] || (strength >= ANOTHER[0] && spread <= ONE_REST);
+        if let Some(row) = self.torn_at.filter(|_| is_another) {
             return Cause::Torn(row);
         }
-        if self.unexplained < WHOLE_FRAME {
+        if self.disturbed() < WHOLE_FRAME {
             return Cause::Local;
         }
-        match strength {
-            strength if strength >= STALE_SHARE => Cause::OtherPicture,
-            rest if self.strength_spread.is_some_and(|spread| spread <= ONE_REST) => Cause::Rest(rest),
-            _ => Cause::Local,
+        match is_another {
+            true => Cause::OtherPicture,
+            // Where the references carry a rest, too, it comes once or twice, and always brightens.
+            false if spread <= ONE_REST || self.one_sided >= ONE_SIDED => Cause::Rest(strength),
+            false => Cause::Local,
         }
     }
 }

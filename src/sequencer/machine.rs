@@ -328,7 +328,9 @@ impl Machine {
                 vec![Action::Accept { group }]
             }
             // Light that stays changed: another try would show the same, and the decode stands.
-            PairVerdict::Retake(suspicion) if is_of_the_light(&suspicion) && !self.may_help(group, &suspicion) => {
+            PairVerdict::Retake(suspicion)
+                if is_of_the_light(&suspicion) && !self.may_help(group, &suspicion) =>
+            {
                 self.findings.push(finding(suspicion));
                 vec![Action::Accept { group }]
             }

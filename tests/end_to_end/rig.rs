@@ -52,7 +52,8 @@ impl Rig {
 
     /// Adds an entry to `[[sim.faults]]`, given as an inline table.
     pub fn fault(mut self, entry: &str) -> Self {
-        let entry: Table = toml::from_str::<Table>(&format!("fault = {{ {entry} }}")).expect("an inline table");
+        let entry: Table =
+            toml::from_str::<Table>(&format!("fault = {{ {entry} }}")).expect("an inline table");
         let sim = at(&mut self.config, &["sim"]);
         let faults = sim.entry("faults").or_insert_with(|| toml::Value::Array(Vec::new()));
         faults.as_array_mut().expect("a list of faults").push(entry["fault"].clone());

@@ -17,23 +17,31 @@ pub struct Case {
 }
 
 /// Numbers that differ from seed to seed (SplitMix64).
-pub struct Random(u64);
+pub struct Random {
+    state: u64,
+    scale: f64,
+}
 
 impl Random {
-    /// Starts at a seed.
-    pub fn new(seed: u64) -> Self {
-        Self(seed.wrapping_mul(0x9e37_79b9_7f4a_7c15))
+    /// Starts at a seed, for the paper's rig divided by `scale`.
+    pub fn new(seed: u64, scale: f64) -> Self {
+        Self { state: seed.wrapping_mul(0x9e37_79b9_7f4a_7c15), scale }
     }
 
     fn share(&mut self) -> f64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let word = (self.0 ^ (self.0 >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        self.state = self.state.wrapping_add(0x9e37_79b9_7f4a_7c15);
+        let word = (self.state ^ (self.state >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
         let word = (word ^ (word >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
         ((word ^ (word >> 31)) >> 11) as f64 / (1u64 << 53) as f64
     }
 
     fn between(&mut self, low: f64, high: f64) -> f64 {
         low + (high - low) * self.share()
+    }
+
+    /// A row of the camera, away from the rims.
+    fn row(&mut self) -> u64 {
+        (self.between(0.25, 0.75) * 1200.0 / self.scale) as u64
     }
 
     /// One of `low..high`.
@@ -70,6 +78,11 @@ fn flickering(rig: Rig, share: f64, hz: f64) -> Rig {
     rig.set("sim.flicker.share", share).set("sim.flicker.hz", hz)
 }
 
+/// A frequency like that of the mains, off the multiples of the frame rate (15 Hz), at which a scan sees nothing of it.
+fn mains(random: &mut Random) -> f64 {
+    15.0 * random.whole(6, 8) as f64 + random.between(2.0, 13.0)
+}
+
 /// All of them.
 pub fn all() -> Vec<Case> {
     let mut all = frames();
@@ -88,7 +101,7 @@ fn frames() -> Vec<Case> {
         }),
         // In the order of arrival nothing is wrong with frames that are only late.
         case("late frame", &["lost-frame"], &["ok"], |rig, random| {
-            rig.fault(&at_frame("late-frame", ", by_ms = 1500.0", random))
+            rig.fault(&at_frame("late-frame", ", by_ms = 400.0", random))
         }),
         case("duplicate frame", &["stale-frame", "duplicate-frame"], &["stale-frame"], |rig, random| {
             rig.fault(&at_frame("duplicate-frame", "", random))
@@ -100,11 +113,11 @@ fn frames() -> Vec<Case> {
             rig.fault("kind = \"stale-frame\", frame = 1")
         }),
         case("torn frame", &["torn-frame"], &["torn-frame"], |rig, random| {
-            let row = random.whole(80, 220);
+            let row = random.row();
             rig.fault(&at_frame("torn-frame", &format!(", row = {row}"), random))
         }),
         case("dead sensor row", &["sensor-defect"], &["sensor-defect"], |rig, random| {
-            let row = random.whole(40, 260);
+            let row = random.row();
             rig.fault(&format!("kind = \"dead-row\", row = {row}"))
         }),
     ]
@@ -143,17 +156,20 @@ fn display() -> Vec<Case> {
 fn light() -> Vec<Case> {
     vec![
         case("lamp flickers by 3 %", &["flicker"], &["flicker"], |rig, random| {
-            flickering(rig, 0.03, random.between(90.0, 125.0))
+            flickering(rig, 0.03, mains(random))
         }),
         case("lamp flickers by 10 %", &["flicker"], &["flicker"], |rig, random| {
-            flickering(rig, 0.1, random.between(90.0, 125.0))
+            flickering(rig, 0.1, mains(random))
         }),
         case("lamp flickers by 10 %, slowly", &["flicker"], &["flicker"], |rig, random| {
             flickering(rig, 0.1, random.between(0.7, 7.0))
         }),
-        case("lamp flickers by 5 %, within half a period", &["flicker", "exposure-drift"], &["flicker", "exposure-drift"], |rig, random| {
-            flickering(rig, 0.05, random.between(0.15, 0.3))
-        }),
+        case(
+            "lamp flickers by 5 %, within half a period",
+            &["flicker", "exposure-drift"],
+            &["flicker", "exposure-drift"],
+            |rig, random| flickering(rig, 0.05, random.between(0.15, 0.3)),
+        ),
         case("lamp dips once", &["flicker"], &["flicker"], |rig, random| {
             let at_ms = random.between(300.0, 2000.0);
             rig.fault(&format!("kind = \"lamp-burst\", at_ms = {at_ms}, for_ms = 90.0, share = -0.2"))
@@ -204,12 +220,18 @@ fn optics() -> Vec<Case> {
                 "kind = \"bumped-object\", at_ms = {at_ms}, object = \"black\", by_mm = [{mm}, 0.0, 0.0]"
             ))
         }),
-        case("polarizer turned by 15 to 35 degrees", &["polarization-weak"], &["polarization-weak"], |rig, random| {
-            turned(rig, random.between(15.0, 35.0))
-        }),
-        case("polarizer turned by 60 to 90 degrees", &["polarization-inverted"], &["polarization-inverted"], |rig, random| {
-            turned(rig, random.between(60.0, 90.0))
-        }),
+        case(
+            "polarizer turned by 15 to 35 degrees",
+            &["polarization-weak"],
+            &["polarization-weak"],
+            |rig, random| turned(rig, random.between(15.0, 35.0)),
+        ),
+        case(
+            "polarizer turned by 60 to 90 degrees",
+            &["polarization-inverted"],
+            &["polarization-inverted"],
+            |rig, random| turned(rig, random.between(60.0, 90.0)),
+        ),
         case("channels exchanged", &["polarization-inverted"], &["polarization-inverted"], |rig, _| {
             rig.set("projector.horizontal", "rb").set("projector.vertical", "g")
         }),
@@ -223,21 +245,36 @@ fn modes() -> Vec<Case> {
     let in_mode = |mode, case: Case| Case { mode: Some(mode), ..case };
     vec![
         in_mode("paper", case("paper: nothing wrong", &["ok"], &["ok"], |rig, _| rig)),
-        in_mode("paper", case("paper: channels exchanged", &["polarization-inverted"], &["polarization-inverted"], |rig, _| {
-            rig.set("projector.horizontal", "rb").set("projector.vertical", "g")
-        })),
-        in_mode("paper", case("paper: stale frame", &["stale-frame"], &["stale-frame"], |rig, random| {
-            rig.fault(&at_frame("stale-frame", "", random))
-        })),
+        in_mode(
+            "paper",
+            case(
+                "paper: channels exchanged",
+                &["polarization-inverted"],
+                &["polarization-inverted"],
+                |rig, _| rig.set("projector.horizontal", "rb").set("projector.vertical", "g"),
+            ),
+        ),
+        in_mode(
+            "paper",
+            case("paper: stale frame", &["stale-frame"], &["stale-frame"], |rig, random| {
+                rig.fault(&at_frame("stale-frame", "", random))
+            }),
+        ),
         in_mode("fast", case("fast: nothing wrong", &["ok"], &["ok"], |rig, _| rig)),
-        in_mode("fast", case("fast: P and Q exchanged", &["swapped-frames"], &["swapped-frames"], |rig, random| {
-            let slide = 2 + 2 * random.whole(0, 7);
-            rig.fault(&format!("kind = \"exchanged-slides\", slide = {slide}"))
-        })),
+        in_mode(
+            "fast",
+            case("fast: P and Q exchanged", &["swapped-frames"], &["swapped-frames"], |rig, random| {
+                let slide = 2 + 2 * random.whole(0, 7);
+                rig.fault(&format!("kind = \"exchanged-slides\", slide = {slide}"))
+            }),
+        ),
         in_mode("gray", case("gray: nothing wrong", &["ok"], &["ok"], |rig, _| rig)),
-        in_mode("gray", case("gray: torn frame", &["torn-frame"], &["torn-frame"], |rig, random| {
-            let row = random.whole(80, 220);
-            rig.fault(&at_frame("torn-frame", &format!(", row = {row}"), random))
-        })),
+        in_mode(
+            "gray",
+            case("gray: torn frame", &["torn-frame"], &["torn-frame"], |rig, random| {
+                let row = random.row();
+                rig.fault(&at_frame("torn-frame", &format!(", row = {row}"), random))
+            }),
+        ),
     ]
 }

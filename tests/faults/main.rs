@@ -78,7 +78,8 @@ fn every_fault_is_named_and_none_ends_in_a_wrong_cloud_called_ok() {
     for (case, tallies) in &rows {
         for (way, tally) in ["live", "alone"].iter().zip(tallies) {
             if f64::from(tally.right) < NAMED * f64::from(tally.runs) {
-                failures.push(format!("{} ({way}): {} of {} named right", case.name, tally.right, tally.runs));
+                failures
+                    .push(format!("{} ({way}): {} of {} named right", case.name, tally.right, tally.runs));
             }
             if tally.wrong_ok > 0 {
                 failures.push(format!("{} ({way}): {} wrong clouds called ok", case.name, tally.wrong_ok));
@@ -89,7 +90,7 @@ fn every_fault_is_named_and_none_ends_in_a_wrong_cloud_called_ok() {
 }
 
 fn run(case: &Case, seed: u64, scale: f64) -> [Option<Found>; 2] {
-    let mut random = Random::new(seed);
+    let mut random = Random::new(seed, scale);
     let rig = (case.build)(Rig::scaled(scale).set("sim.seed", seed as i64), &mut random);
     let mut arguments = vec![];
     if let Some(mode) = case.mode {

@@ -34,11 +34,8 @@ pub fn record(rig: &Rig, mode: Option<&str>, out: &str) {
     };
     let plan = Plan::new(sequence.clone(), settings.polarization, &info, applied.clone(), &options)
         .expect("a timetable");
-    let slides: Vec<_> = sequence
-        .roles
-        .iter()
-        .map(|&role| slide(sequence.raster(role, settings.polarization)))
-        .collect();
+    let slides: Vec<_> =
+        sequence.roles.iter().map(|&role| slide(sequence.raster(role, settings.polarization))).collect();
     devices.projector.load(&slides).expect("the slides are loaded");
     devices.camera.arm(slides.len()).expect("the camera is armed");
 

@@ -104,7 +104,9 @@ impl Stream {
             Delivered::Never => return None,
             Delivered::Whole | Delivered::Twice => store,
             Delivered::Stale => before,
-            Delivered::Torn(row) => torn(&*store, &*before, row as usize * self.response.region.width as usize),
+            Delivered::Torn(row) => {
+                torn(&*store, &*before, row as usize * self.response.region.width as usize)
+            }
         };
         self.statistics.frames += 1;
         let frame = Frame {

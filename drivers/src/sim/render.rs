@@ -152,8 +152,8 @@ impl Renderer {
                     row.iter_mut().zip(source).for_each(|(sum, light)| *sum += weight * light);
                 }
                 let sensor_row = response.region.y + y as u32;
-                let first = u64::from(sensor_row) * u64::from(self.camera.size[0])
-                    + u64::from(response.region.x);
+                let first =
+                    u64::from(sensor_row) * u64::from(self.camera.size[0]) + u64::from(response.region.x);
                 let pattern = self.pattern.as_ref().map(|pattern| &pattern[first as usize..][..width]);
                 developer.develop(stream, first, row, pattern, self.script.is_dead(sensor_row));
                 out.iter_mut().zip(row.iter()).for_each(|(out, dn)| *out = sample(*dn));

@@ -11,11 +11,7 @@ use super::{
     camera::SimCameras, description::RigDescription, panel::Panel, projector::SimProjectors,
     render::Renderer, scene::Scene, script::Script, timeline::Timeline, world::World,
 };
-use crate::{
-    camera::Region,
-    clock::Clock,
-    error::DeviceError,
-};
+use crate::{camera::Region, clock::Clock, error::DeviceError};
 
 /// Why a rig cannot be built.
 #[derive(Debug, Clone, PartialEq, Error)]
@@ -203,7 +199,8 @@ impl Rig {
         }
         let panel = Panel::new(&description.projector);
         let world = World::new(description, scene, &panel)?;
-        let bumped = script.bump().map(|(_, bump)| world.bumped(description, scene, &panel, &bump)).transpose()?;
+        let bumped =
+            script.bump().map(|(_, bump)| world.bumped(description, scene, &panel, &bump)).transpose()?;
         let shared = Shared {
             description: description.clone(),
             clock,

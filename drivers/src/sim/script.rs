@@ -160,7 +160,8 @@ fn a_third() -> f64 {
 impl FaultDescription {
     /// Adds what is wrong with it, below `key`.
     pub(crate) fn validate(&self, faults: &mut Faults, key: &str) {
-        let mut time = |name: &str, value: f64| faults.within(&format!("{key}.{name}"), value, 0.0, LONGEST_MS);
+        let mut time =
+            |name: &str, value: f64| faults.within(&format!("{key}.{name}"), value, 0.0, LONGEST_MS);
         match *self {
             Self::LateFrame { by_ms, .. } => time("by_ms", by_ms),
             Self::LampBurst { at_ms, for_ms, share } => {
@@ -305,7 +306,9 @@ impl Script {
 
     /// Whether a row of the sensor is dead.
     pub(crate) fn is_dead(&self, sensor_row: u32) -> bool {
-        self.faults.iter().any(|fault| matches!(*fault, FaultDescription::DeadRow { row } if row == sensor_row))
+        self.faults
+            .iter()
+            .any(|fault| matches!(*fault, FaultDescription::DeadRow { row } if row == sensor_row))
     }
 
     pub(crate) fn auto_exposure(&self) -> Option<AutoExposure> {
@@ -330,8 +333,12 @@ impl Script {
             FaultDescription::ExchangedSlides { slide: first } if shown == first && shown + 1 < slides => {
                 shown + 1
             }
-            FaultDescription::ExchangedSlides { slide: first } if first.checked_add(1) == Some(shown) => first,
-            FaultDescription::DelayedSlides { slide: first, by } if shown >= first => shown.saturating_sub(by),
+            FaultDescription::ExchangedSlides { slide: first } if first.checked_add(1) == Some(shown) => {
+                first
+            }
+            FaultDescription::DelayedSlides { slide: first, by } if shown >= first => {
+                shown.saturating_sub(by)
+            }
             _ => shown,
         })
     }
@@ -484,7 +491,8 @@ mod tests {
 
     #[test]
     fn unknown_kinds_and_keys_are_refused() {
-        for text in ["kind = \"gremlins\"", "kind = \"dead-row\"\nrow = 1\ncolumn = 2", "kind = \"dead-row\""] {
+        for text in ["kind = \"gremlins\"", "kind = \"dead-row\"\nrow = 1\ncolumn = 2", "kind = \"dead-row\""]
+        {
             assert!(toml::from_str::<FaultDescription>(text).is_err(), "{text}");
         }
     }

@@ -125,7 +125,8 @@ impl Timeline {
 
     /// Jumps of the lamp within an exposure, in order.
     fn lamp_jumps(&self, start: Timestamp, end: Timestamp) -> Vec<Timestamp> {
-        let jumps = self.script.lamp_jumps_ns().into_iter().map(|ns| Timestamp(self.armed.0.saturating_add(ns)));
+        let jumps =
+            self.script.lamp_jumps_ns().into_iter().map(|ns| Timestamp(self.armed.0.saturating_add(ns)));
         let mut within: Vec<Timestamp> = jumps.filter(|jump| (start..end).contains(jump)).collect();
         within.sort_unstable();
         within

@@ -232,7 +232,8 @@ impl World {
                     if sight.is_lit() {
                         let object = tracer.primitives[usize::from(sight.face)].object;
                         let pixel = [x as f64, (y - self.border) as f64];
-                        let again = aligned.as_ref().and_then(|tracer| Some(tracer.look(tracer.camera.ray(pixel)?)));
+                        let again =
+                            aligned.as_ref().and_then(|tracer| Some(tracer.look(tracer.camera.ray(pixel)?)));
                         let gain = again.map_or(view.gain, |(view, _)| view.gain);
                         let seen: f64 =
                             drive.iter().zip(gain).map(|(drive, gain)| drive * f64::from(gain)).sum();

@@ -34,7 +34,9 @@ fn advice(diagnosis: Diagnosis) -> &'static str {
         Diagnosis::AmbientDrift => "keep other light in the room constant",
         Diagnosis::DeviceFault => "check the device and scan again",
         Diagnosis::NonlinearResponse => "switch off sharpening and picture modes of the projector",
-        Diagnosis::NoiseModel => "measure it with `polscan calibrate noise`, and check the camera's gamma and gain",
+        Diagnosis::NoiseModel => {
+            "measure it with `polscan calibrate noise`, and check the camera's gamma and gain"
+        }
         Diagnosis::Cancelled => "scan again when ready",
         _ => "read the evidence before trusting the result",
     }

@@ -64,7 +64,10 @@ fn modulation(frames: Frames, bright: &[Plane<'_>], dark: &[Plane<'_>], at: usiz
     let black = frames.decoded.black_level_dn;
     let mean = |planes: &[Plane<'_>]| {
         let sum: f64 = planes.iter().map(|plane| crate::evidence::sample(*plane, at) - black).sum();
-        (sum / planes.len() as f64, frames.decoded.noise.variance(sum / planes.len() as f64) / planes.len() as f64)
+        (
+            sum / planes.len() as f64,
+            frames.decoded.noise.variance(sum / planes.len() as f64) / planes.len() as f64,
+        )
     };
     let ((high, of_high), (low, of_low)) = (mean(bright), mean(dark));
     (high - low) / (of_high + of_low).sqrt()

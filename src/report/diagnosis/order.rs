@@ -89,7 +89,9 @@ pub fn reversed(
         };
         let (mut seen, mut rising, mut jumps) = (0u64, 0u64, 0u64);
         for &[here, right, _, next] in &places {
-            let (Some(here), Some(right), Some(next)) = (word(here), word(right), word(next)) else { continue };
+            let (Some(here), Some(right), Some(next)) = (word(here), word(right), word(next)) else {
+                continue;
+            };
             seen += 1;
             rising += u64::from(right > here);
             jumps += u64::from((next - here).abs() > 2);

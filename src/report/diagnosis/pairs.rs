@@ -87,7 +87,7 @@ struct Case<'a> {
 
 impl Case<'_> {
     fn share(&self) -> f64 {
-        self.look.as_ref().map_or(self.view.outliers(), |look| look.unexplained)
+        self.look.as_ref().map_or(self.view.outliers(), Look::disturbed)
     }
 
     fn strength(&self) -> Option<f64> {
@@ -144,7 +144,18 @@ fn sort<'a>(coarse: &[View<'a>], frames: Option<Frames>, measured_noise: bool) -
 /// All reasons that the pair sums give. `frames` allow a closer look at pairs that fail.
 pub fn diagnose(decoded: &Decoded, frames: Option<Frames>) -> Vec<Reason> {
     let views = views(&decoded.pairs);
-    let (fine, mut coarse): (Vec<View>, Vec<View>) = views.iter().partition(|view| view.rank < FINE_RANKS);
+    let (mut fine, mut coarse): (Vec<View>, Vec<View>) =
+        views.iter().partition(|view| view.rank < FINE_RANKS);
+    // Compared with the mean of all pairs, every pair shows what is wrong with one of them; the median does not.
+    if let Some(frames) = frames.filter(|frames| !frames.has_references())
+        && fine.iter().any(|view| view.outliers() > SOUND_OUTLIERS)
+    {
+        for view in &mut fine {
+            if let Some(look) = frames.look(view.pair.axis, view.pair.bit, false) {
+                (view.flat, view.edge) = (look.disturbed(), look.disturbed());
+            }
+        }
+    }
     if coarse.is_empty() {
         coarse.clone_from(&views);
     }
@@ -237,7 +248,8 @@ fn lone<'a>(fine: &[View<'a>]) -> Option<View<'a>> {
 
 /// A response that is not linear shows at stripe edges, or in the finest stripes, which have nothing else.
 fn nonlinear(sound: &[View], fine: &[View]) -> Option<Reason> {
-    let mut edges: Vec<f64> = sound.iter().map(|view| view.edge).collect();
+    // Where as many flat pixels are off, too, it is not the edges.
+    let mut edges: Vec<f64> = sound.iter().map(|view| (view.edge - 2.0 * view.flat).max(0.0)).collect();
     let edges = statistics::median(&mut edges).unwrap_or(0.0);
     let finest: Vec<View> = fine.iter().filter(|view| view.rank <= 1).copied().collect();
     let worst_fine = worst(&finest, |view| view.shift.abs().max(view.sigma()))

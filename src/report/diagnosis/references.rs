@@ -5,7 +5,7 @@ use serde_json::json;
 use super::{Diagnosis, Reason};
 use crate::{
     decode::Plane,
-    evidence::Frames,
+    evidence::{Frames, is_another_picture},
     sequencer::{PairThresholds, PairVerdict, compare_pixels, drift_rule},
 };
 use polscan_drivers::frame::Pixels;
@@ -22,15 +22,25 @@ fn pixels(plane: Plane<'_>) -> Pixels<'_> {
 pub fn disagree(frames: Frames) -> Option<Reason> {
     let roles = [Role::ReferenceV, Role::ReferenceH, Role::Black, Role::White];
     roles.into_iter().find_map(|role| {
-        let [first, .., last] = frames.of(role)[..] else { return None };
+        let planes = frames.of(role);
+        let [first, .., last] = &planes[..] else { return None };
+        let first = *first;
         let camera = &frames.settings.camera;
         let camera = crate::decode::CameraResponse {
             black_level_dn: Some(frames.decoded.black_level_dn),
             ..*camera
         };
-        let change = compare_pixels(pixels(first), pixels(last), &camera, frames.decoded.noise)?;
+        let change = compare_pixels(pixels(first), pixels(*last), &camera, frames.decoded.noise)?;
         match drift_rule(role, &change, &PairThresholds::default()) {
-            PairVerdict::Retake(suspicion) if suspicion.reason == Diagnosis::StaleFrame.slug() => {
+            PairVerdict::Retake(suspicion)
+                if suspicion.reason == Diagnosis::StaleFrame.slug()
+                    && is_another_picture(
+                        [first, *last],
+                        |at| f64::from(frames.decoded.modulation.data()[at]),
+                        frames.decoded.noise,
+                        frames.decoded.black_level_dn,
+                    ) =>
+            {
                 Some(Reason::failed(
                     Diagnosis::StaleFrame,
                     format!(

@@ -85,9 +85,8 @@ fn from_pixels(input: &ReportInput, decoded: &Decoded, pixels: &PixelCounts) -> 
     reasons.extend(pairs::diagnose(decoded, look));
     if !reasons.is_empty() && look.is_some_and(|frames| !frames.last_references) {
         // A drift between references that show different pictures is none.
-        reasons.retain(|reason| {
-            !matches!(reason.diagnosis, Diagnosis::ExposureDrift | Diagnosis::AmbientDrift)
-        });
+        reasons
+            .retain(|reason| !matches!(reason.diagnosis, Diagnosis::ExposureDrift | Diagnosis::AmbientDrift));
     }
     let names = [
         Diagnosis::StaleFrame,
@@ -106,7 +105,10 @@ fn from_pixels(input: &ReportInput, decoded: &Decoded, pixels: &PixelCounts) -> 
     reasons.extend(polarization(input, decoded, pixels));
     reasons.extend(saturated(decoded, pixels));
     reasons.extend(input.reconstruction.and_then(|made| made.row_check).and_then(row_mismatch));
-    reasons.extend(sensor::defect(decoded, pixels));
+    // Beside saturated pixels others fail, too, without being dead.
+    let glares = reasons.iter().any(|reason| reason.diagnosis == Diagnosis::Saturated);
+    let defect = sensor::defect(decoded, pixels);
+    reasons.extend(defect.filter(|reason| !glares || has_lines(reason)));
     reasons.extend(low_coverage(pixels).or_else(|| dark::too_dark(look?, pixels)));
     if reasons.iter().any(is_wrong) {
         // What comes of words that are wrong says nothing of light, sensor or surface.
@@ -124,6 +126,13 @@ fn from_pixels(input: &ReportInput, decoded: &Decoded, pixels: &PixelCounts) -> 
         });
     }
     reasons
+}
+
+/// Whether a defect of the sensor is one of whole lines.
+fn has_lines(reason: &Reason) -> bool {
+    ["columns", "rows"]
+        .iter()
+        .any(|key| reason.evidence[key].as_array().is_some_and(|lines| !lines.is_empty()))
 }
 
 /// Of several reasons with the same diagnosis keeps the gravest, of equals the first, with what the others say beside
@@ -187,7 +196,8 @@ fn frames(capture: &CaptureSummary) -> Vec<Reason> {
     // A lost frame that was noticed and taken again has cost time, nothing else: each asks for one take.
     let pairs = capture.retaken.iter().map(|retake| &retake.reason);
     let references = capture.references_retaken.iter().map(|retake| &retake.reason);
-    let noticed = pairs.chain(references).filter(|reason| captured::diagnosis(reason) == Diagnosis::LostFrame);
+    let noticed =
+        pairs.chain(references).filter(|reason| captured::diagnosis(reason) == Diagnosis::LostFrame);
     let retaken = noticed.count() as u64;
     let lost = capture.lost_frames();
     if lost > retaken {
@@ -310,7 +320,8 @@ fn polarization(input: &ReportInput, decoded: &Decoded, pixels: &PixelCounts) ->
                 Diagnosis::PolarizationInverted,
                 format!(
                     "on {percent:.0} % of the lit pixels V is brighter than H; H and V are exchanged: turn the polarizer \
-                     in front of the camera by 90 degrees, or exchange the projector's channels in the configuration"
+                     in front of the camera by 90 degrees, or exchange the projector's channels in the configuration; \
+                     or all that is seen scatters light and absorbs the colour of H, as red paint does"
                 ),
                 evidence,
             ),
@@ -796,7 +807,13 @@ mod tests {
         let found = [reason(DEGRADED), reason(FAILED), reason(DEGRADED)];
         let input =
             ReportInput { found: &found, ..ReportInput::new(Mode::Pse, Size { width: 1, height: 1 }, 0) };
-        assert_eq!(diagnose(&input, None), [reason(FAILED)]);
+        let [kept] = &diagnose(&input, None)[..] else { panic!("one reason") };
+        assert_eq!(
+            (kept.diagnosis, kept.severity, kept.message.as_str()),
+            (Diagnosis::Motion, FAILED, "moved")
+        );
+        // What the others say is kept beside it.
+        assert_eq!(kept.evidence["also"].as_array().map(Vec::len), Some(2));
     }
 
     #[test]

@@ -337,14 +337,15 @@ fn a_pair_that_stays_suspicious_fails_the_scan_by_name() {
 #[test]
 fn light_that_stays_changed_is_noted_after_one_try_and_the_scan_goes_on() {
     let mut story = Story::begin(Mode::Pse);
-    for group in [2, 2, 3] {
+    // Group 3 was under way when 2 was refused; by the time of 4 it is known that another try does not help.
+    for group in [2, 3, 2, 3, 4] {
         story.until(|action| *action == Action::Judge(Subject::Pair { group }));
         story.tell(Event::Judged(Subject::Pair { group }, suspicious("flicker")));
     }
     assert_eq!(story.outcome(), Outcome::Complete);
-    assert_eq!(story.retakes(), [(2, "flicker", 1)]);
+    assert_eq!(story.retakes(), [(2, "flicker", 1), (3, "flicker", 1)]);
     let findings: Vec<_> = story.machine.findings().iter().map(|finding| finding.reason.as_str()).collect();
-    assert_eq!(findings, ["flicker", "flicker"]);
+    assert_eq!(findings, ["flicker"; 3]);
 }
 
 #[test]

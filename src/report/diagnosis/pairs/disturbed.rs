@@ -33,6 +33,17 @@ pub(super) fn disturbance(disturbed: &[Case], coarse: usize, frames: Option<Fram
     if disturbed.len() as f64 <= (FEW_PAIRS * coarse as f64).max(2.0) {
         return one_frame(disturbed);
     }
+    let rests: Vec<f64> = disturbed
+        .iter()
+        .filter_map(|case| match case.look.as_ref()?.cause() {
+            Cause::Rest(rest) => Some(rest),
+            _ => None,
+        })
+        .collect();
+    if 2 * rests.len() > disturbed.len() {
+        let rest = statistics::median(&mut rests.clone()).unwrap_or(0.0);
+        return unsettled(disturbed, rest, all_evidence(disturbed));
+    }
     let share = disturbed.iter().map(Case::share).fold(0.0, f64::max);
     let looks: Vec<&Look> = disturbed.iter().filter_map(|case| case.look.as_ref()).collect();
     let mut same: Vec<f64> = looks.windows(2).filter_map(|pair| pair[0].same_pixels(pair[1])).collect();
@@ -73,7 +84,8 @@ fn unsettled(disturbed: &[Case], rest: f64, evidence: Value) -> Reason {
     )
 }
 
-/// Frames that fit when those of the place before, or behind, are taken for them: one was lost, or came twice.
+/// Frames that fit when those of the place before or behind are taken for them: one was lost, or came twice. Both fit at
+/// once, as the pair before and the pair behind; what stands in the places of the last references tells which it is.
 fn arrival(disturbed: &[Case], frames: Frames) -> Option<Reason> {
     let fits = |from: isize| {
         let sound = disturbed.iter().filter(|case| {
@@ -89,11 +101,17 @@ fn arrival(disturbed: &[Case], frames: Frames) -> Option<Reason> {
         });
         sound.count() as f64 >= FITTING * disturbed.len() as f64
     };
-    if disturbed.len() < LEAST_FITTING {
+    if disturbed.len() < LEAST_FITTING || !(fits(-1) || fits(1)) {
         return None;
     }
+    let [bright, dark] = frames.all_references()?;
+    let ([first_bright, .., last_bright], [first_dark, .., last_dark]) = (&bright[..], &dark[..]) else {
+        return None;
+    };
+    let early = frames.are_alike(*last_dark, *first_bright);
+    let late = frames.are_alike(*last_bright, *first_dark);
     let mut evidence = all_evidence(disturbed);
-    if fits(-1) {
+    if early && !late {
         evidence["off_by_frames"] = json!(1);
         return Some(Reason::failed(
             Diagnosis::LostFrame,
@@ -105,7 +123,7 @@ fn arrival(disturbed: &[Case], frames: Frames) -> Option<Reason> {
             evidence,
         ));
     }
-    fits(1).then(|| {
+    late.then(|| {
         evidence["off_by_frames"] = json!(-1);
         Reason::failed(
             Diagnosis::StaleFrame,
