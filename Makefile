@@ -1,5 +1,5 @@
 # Two commands are all that is needed: `make run` and `make test`. Both install what is missing first.
-.PHONY: run test captures foreign-plane fuzz accuracy install ci
+.PHONY: run test captures foreign-plane fuzz accuracy faults install ci
 
 run: ## build, scan the simulated rig, say where the results are
 	@scripts/install build
@@ -12,6 +12,10 @@ test: ## every test that needs no device
 captures: ## decode real captures made by others (POLSCAN_CAPTURES names their folder)
 	@scripts/install build
 	@scripts/captures
+
+faults: ## let everything go wrong on the simulated rig, and see what it is called
+	@scripts/install build
+	@scripts/faults
 
 foreign-plane: ## check the decoder from outside, with an independent numpy model
 	@scripts/install test

@@ -9,6 +9,7 @@ pub mod compare;
 pub mod config;
 pub mod decode;
 pub mod engine;
+mod evidence;
 pub mod geometry;
 pub mod grid;
 pub mod pipeline;

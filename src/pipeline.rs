@@ -134,6 +134,8 @@ pub struct Context<'a> {
     pub found: &'a [Reason],
     /// Regions whose flatness is wanted.
     pub regions: &'a [NamedRegion],
+    /// H over V that the rig shows on metal, where it is known.
+    pub extinction_ratio: Option<f64>,
     /// Whether the frames come from a simulated rig.
     pub simulated: bool,
     /// Remarks on the input, such as how colour images were read.
@@ -161,6 +163,7 @@ pub fn report(job: &Job, outcome: &Outcome, context: &Context, timings: Timings)
         timings,
         threads: rayon::current_num_threads(),
         simulated: context.simulated,
+        extinction_ratio: context.extinction_ratio,
         ..ReportInput::new(job.decode.mode, size, job.planes.len())
     });
     report.notes.extend_from_slice(context.notes);

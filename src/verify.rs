@@ -11,6 +11,7 @@ use crate::{
         CameraResponse, NoiseModel, PairContext, Plane, PlaneSource, SharedPlane, Thresholds, estimate_noise,
         pair_residual,
     },
+    evidence::{self, Cause},
     sequencer::{Judge, PairThresholds, PairVerdict, Suspicion, compare_references, drift_rule, judge_rule},
 };
 
@@ -37,6 +38,12 @@ pub fn shared_plane(frame: &Frame) -> SharedPlane {
 
 /// Pairs that a noise model is estimated from, one after the other.
 const NOISE_PAIRS: u32 = 4;
+/// Slug of a response that is not linear.
+const NONLINEAR: &str = "nonlinear-response";
+/// Finest bits, which have no flat areas on all rigs.
+const FINE_BITS: u8 = 3;
+/// Noise in units of that assumed, from which on the model does not hold.
+const NOISY: f64 = 1.5;
 /// Pairs that are kept to tell which of two that disagree is the wrong one.
 const WITNESSES: usize = 4;
 
@@ -149,7 +156,30 @@ impl PairSumJudge {
         };
         let [frame, inverse] = frames.map(|frame| plane(frame.pixels()));
         let residual = pair_residual(frame, inverse, &context)?;
-        Some(judge_rule(&residual, self.sequence.code(axis).bits(), &self.limits))
+        let bits = self.sequence.code(axis).bits();
+        let verdict = judge_rule(&residual, bits, &self.limits);
+        let pair = evidence::Pair {
+            frames: [frame, inverse],
+            references: [high, low],
+            width: context.width,
+            saturation_dn: self.camera.saturation_dn,
+            black_dn: self.camera.black_level_dn.unwrap_or(0.0),
+            noise: context.noise,
+        };
+        Some(match verdict {
+            PairVerdict::Accept => PairVerdict::Accept,
+            PairVerdict::Degraded(suspicion) if suspicion.reason == "unverified-pair" => {
+                PairVerdict::Degraded(suspicion)
+            }
+            // A statistic that stands out is looked at where it does: see there for what it is called.
+            PairVerdict::Degraded(suspicion) => named(suspicion, false, &pair, self.is_fine(axis, bit)),
+            PairVerdict::Retake(suspicion) => named(suspicion, true, &pair, self.is_fine(axis, bit)),
+        })
+    }
+
+    /// Whether stripes are too narrow for flat areas.
+    fn is_fine(&self, axis: Axis, bit: u8) -> bool {
+        bit + FINE_BITS >= self.sequence.code(axis).bits()
     }
 
     /// Verdict on `pair` by `other` where either may be the wrong one.
@@ -164,6 +194,14 @@ impl PairSumJudge {
             PairVerdict::Retake(suspicion) => Some(PairVerdict::Retake(suspicion)),
             _ => Some(verdict),
         }
+    }
+
+    /// Whether two frames of a reference are as far apart as different pictures.
+    fn is_another(&self, first: &Frame, last: &Frame) -> bool {
+        let (Some([high, low]), Some(noise)) = (self.levels(), self.noise) else { return true };
+        let modulation = |at: usize| f64::from(high.pixels().get(at)) - f64::from(low.pixels().get(at));
+        let planes = [first, last].map(|frame| plane(frame.pixels()));
+        evidence::is_another_picture(planes, modulation, noise, self.camera.black_level_dn.unwrap_or(0.0))
     }
 
     fn agree(&self, pair: &Pair, other: &Pair) -> bool {
@@ -210,6 +248,42 @@ impl PairSumJudge {
             self.witnesses.push(pair);
         }
         Some(verdict)
+    }
+}
+
+/// The verdict on a suspicious pair after a closer look. `grave`: its statistics alone ask for another take.
+fn named(suspicion: Suspicion, grave: bool, pair: &evidence::Pair<'_>, fine: bool) -> PairVerdict {
+    let verdict = |suspicion| match grave {
+        true => PairVerdict::Retake(suspicion),
+        false => PairVerdict::Degraded(suspicion),
+    };
+    let Some(look) = pair.look(!fine) else { return verdict(suspicion) };
+    let cause = look.cause();
+    // Fine stripes are nowhere flat, so that a response that is not linear spoils all of them; as much as another
+    // picture does it does not.
+    let cause = match cause {
+        Cause::Rest(_) | Cause::Local if fine => Cause::Nothing,
+        cause => cause,
+    };
+    let evidence = format!(
+        "{}; {}: {:.2} % of the pixels, {:+.1} % brightness, {:.2} times the assumed noise from pixel to pixel",
+        suspicion.evidence,
+        cause.words(),
+        100.0 * look.unexplained,
+        100.0 * look.change,
+        look.noise
+    );
+    let named = |reason: &str| Suspicion { reason: reason.into(), evidence: evidence.clone(), ..suspicion };
+    match cause {
+        Cause::Nothing if suspicion.reason == NONLINEAR => PairVerdict::Degraded(suspicion),
+        Cause::Nothing if look.noise >= NOISY => PairVerdict::Degraded(named("noise-model")),
+        Cause::Nothing if grave => PairVerdict::Degraded(named(NONLINEAR)),
+        Cause::Nothing => PairVerdict::Degraded(suspicion),
+        // The next picture would carry the same rest.
+        Cause::Rest(_) => PairVerdict::Degraded(named("unsettled-display")),
+        Cause::Lamp | Cause::Room | Cause::OtherPicture | Cause::Torn(_) | Cause::Local => {
+            PairVerdict::Retake(named(cause.slug().unwrap_or("motion")))
+        }
     }
 }
 
@@ -262,7 +336,15 @@ impl Judge for PairSumJudge {
     fn drift(&mut self, role: Role, first: &Frame, last: &Frame) -> PairVerdict {
         let change = self.noise.and_then(|noise| compare_references(first, last, &self.camera, noise));
         match change {
-            Some(change) => drift_rule(role, &change, &self.limits),
+            Some(change) => match drift_rule(role, &change, &self.limits) {
+                PairVerdict::Retake(suspicion)
+                    if suspicion.reason == "stale-frame" && !self.is_another(first, last) =>
+                {
+                    // The next picture would carry the same rest.
+                    PairVerdict::Degraded(Suspicion { reason: "unsettled-display".into(), ..suspicion })
+                }
+                verdict => verdict,
+            },
             None => PairVerdict::Degraded(Suspicion {
                 reason: "unverified-reference".into(),
                 evidence: format!("{role}: too little light to compare it with the first"),

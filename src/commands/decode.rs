@@ -100,6 +100,7 @@ impl Recorded {
             capture: self.capture.as_ref(),
             found: &self.found,
             regions: &self.regions,
+            extinction_ratio: self.processing.extinction_ratio,
             simulated: self.truth.is_some() || rig.is_some_and(|rig| rig.camera.driver == "sim"),
             notes: &self.notes,
         }
@@ -167,6 +168,8 @@ fn summary(sequence: &[Role], capture: &Capture) -> CaptureSummary {
         hold_frames: capture.hold_refreshes,
         timing_measured: capture.timing_measured,
         retaken: capture.retaken.clone(),
+        references_retaken: capture.notes.references_retaken.clone(),
+        discarded: capture.notes.discarded.clone(),
         statistics: capture.statistics,
         ..CaptureSummary::default()
     }

@@ -69,6 +69,8 @@ pub struct Rig {
     pub calibration_projector_left: bool,
     /// Millimetres per unit of length in the calibrations of other tools.
     pub calibration_unit_mm: f64,
+    /// H over V that the rig shows on metal; 0 is unknown.
+    pub extinction_ratio: f64,
 }
 
 /// `[volume]`

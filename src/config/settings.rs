@@ -46,6 +46,13 @@ pub struct Settings {
     pub sim: Option<(RigDescription, Scene)>,
 }
 
+impl Settings {
+    /// H over V that the rig shows on metal, where it is known.
+    pub fn extinction_ratio(&self) -> Option<f64> {
+        Some(self.raw.rig.extinction_ratio).filter(|&ratio| ratio > 0.0)
+    }
+}
+
 /// Collects `(key, message)`.
 type Faults = Vec<(String, String)>;
 
@@ -105,6 +112,7 @@ fn check_ranges(raw: &Raw, faults: &mut Faults) {
     within("decode.snap_px", raw.decode.snap_px, 0.5, 16.0, " px");
     within("decode.fit_edges", raw.decode.fit_edges as f64, 2.0, 64.0, " edges");
     within("decode.row_gate_px", raw.decode.row_gate_px, 0.1, 1000.0, " px");
+    within("rig.extinction_ratio", raw.rig.extinction_ratio, 0.0, 1e6, "");
     within("volume.near_mm", raw.volume.near_mm, 1.0, 1e6, " mm");
     within("volume.far_mm", raw.volume.far_mm, 1.0, 1e6, " mm");
     if raw.volume.near_mm >= raw.volume.far_mm {

@@ -24,8 +24,11 @@ use super::{
 /// Rows that are looked at after a scan, and for a single pair while the next ones are waiting.
 const ROWS: usize = 300;
 const ROWS_OF_CHECK: usize = 100;
-/// A pixel this near to a stripe edge (in px, along x and y) is not flat.
-const NEAR_EDGE: usize = 2;
+/// A pixel with a stripe edge within these steps (in px, along x and y) is not flat: three sigma of the blur of a usual
+/// chain of projector and camera, as far as a response that is not linear spoils the sum.
+const NEAR_EDGE: [usize; 4] = [1, 2, 4, 6];
+/// Steps of a smaller neighbourhood.
+const BESIDE: [usize; 2] = [1, 2];
 /// Below this many sigma of P - Q it is open which of the two is the brighter.
 const OPEN_SIGMA: f32 = 3.0;
 /// Open pixels, of the nine looked at for an edge, that are no stripe edge: both frames show the same there.
@@ -246,8 +249,9 @@ fn typed_residual<T: Sample>(p: Plane<'_>, q: Plane<'_>, context: &PairContext<'
             }
             let Some(expected) = from_references(&high, &low, at, &gates) else { continue };
             let here = above(at);
-            let flat = neighbours(x, y, width, height).all(|other| above(other) == here)
-                || neighbours(x, y, width, height).chain([at]).filter(|&at| open(at)).count() >= OPEN_PIXELS;
+            let flat = neighbours(NEAR_EDGE, [x, y], [width, height]).all(|other| above(other) == here)
+                || neighbours(BESIDE, [x, y], [width, height]).chain([at]).filter(|&at| open(at)).count()
+                    >= OPEN_PIXELS;
             let residual = (dn_p + dn_q) as f32 - expected.sum + dither(at);
             tally.add(residual * expected.per_sigma, flat);
         }
@@ -255,10 +259,14 @@ fn typed_residual<T: Sample>(p: Plane<'_>, q: Plane<'_>, context: &PairContext<'
     Some(tally.finish(context.axis, context.bit))
 }
 
-/// Pixels up to [`NEAR_EDGE`] away along x and y.
-fn neighbours(x: usize, y: usize, width: usize, height: usize) -> impl Iterator<Item = usize> {
+/// Pixels `steps` away along x and y.
+fn neighbours<const N: usize>(
+    steps: [usize; N],
+    [x, y]: [usize; 2],
+    [width, height]: [usize; 2],
+) -> impl Iterator<Item = usize> {
     let at = y * width + x;
-    (1..=NEAR_EDGE).flat_map(move |step| {
+    steps.into_iter().flat_map(move |step| {
         [
             (x >= step).then(|| at - step),
             (x + step < width).then(|| at + step),
@@ -306,7 +314,7 @@ pub(crate) fn of_scan<T: Sample>(
                 for (changed, words) in
                     changed.iter_mut().zip(&maps.words).filter(|(_, words)| !words.is_empty())
                 {
-                    *changed = neighbours(x, y, width, height)
+                    *changed = neighbours(NEAR_EDGE, [x, y], [width, height])
                         .fold(0, |sum, other| sum | (words[other] ^ words[at]));
                 }
                 (expected.sum, expected.per_sigma, changed)

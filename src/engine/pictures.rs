@@ -5,6 +5,9 @@ use rayon::prelude::*;
 
 use super::results::Results;
 use crate::{
+    decode::Plane,
+    evidence,
+    grid::Grid,
     report::pictures::{
         OverviewInput, ViewSettings, class_picture, cloud_view, column_picture, depth_picture, dolp_picture,
         frame_picture, overview, residual_picture, row_picture,
@@ -36,7 +39,20 @@ pub fn write(writer: &BundleWriter, results: &Results, maps: &Maps) -> Result<()
         let view = || cloud_view(&reconstruction.cloud, &ViewSettings::default());
         pictures.push(("cloud.png", Box::new(view)));
     }
+    if let Some(residual) = worst_pair(results) {
+        pictures.push(("maps/worst-pair.png", Box::new(move || residual_picture(&residual))));
+    }
     pictures.par_iter().try_for_each(|(name, draw)| writer.png(name, &draw()))
+}
+
+/// Residual of the pair that adds up least, where any is conspicuous: where in the image a fault lies.
+fn worst_pair(results: &Results) -> Option<Grid<f32>> {
+    let (job, decoded) = (results.job, &results.outcome.decoded);
+    let planes: Vec<(Role, Plane<'_>)> =
+        job.roles.iter().copied().zip(job.planes.iter().map(|plane| plane.plane())).collect();
+    let frames = evidence::Frames { all: &planes, settings: &job.decode, decoded, last_references: true };
+    let pair = evidence::worst_pair(&decoded.pairs)?;
+    frames.residual_map(pair.axis, pair.bit)
 }
 
 fn sheet(results: &Results, maps: &Maps) -> image::RgbImage {

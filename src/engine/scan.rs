@@ -114,6 +114,7 @@ impl TakenFrames {
             capture: Some(&self.summary),
             found: &self.found,
             regions: &scan.regions,
+            extinction_ratio: scan.settings.extinction_ratio(),
             simulated: scan.simulated,
             notes: &[],
         }
@@ -269,6 +270,7 @@ impl Scan {
             volume: Some(Volume { near_mm, far_mm }),
             row_gate_px,
             regions: self.regions.clone(),
+            extinction_ratio: self.settings.extinction_ratio(),
         });
         manifest
     }

@@ -56,6 +56,8 @@ pub struct ReportInput<'a> {
     pub threads: usize,
     /// Whether the frames come from the simulated rig.
     pub simulated: bool,
+    /// H over V that the rig shows on metal, where it is known.
+    pub extinction_ratio: Option<f64>,
 }
 
 impl<'a> ReportInput<'a> {
@@ -78,6 +80,7 @@ impl<'a> ReportInput<'a> {
             timings: Timings::default(),
             threads: 1,
             simulated: false,
+            extinction_ratio: None,
         }
     }
 
@@ -132,6 +135,10 @@ pub fn build(input: &ReportInput) -> Report {
         planes,
         truth,
         row_check: input.reconstruction.and_then(|made| made.row_check).map(RowCheckReport::from),
+        degree_of_polarization: input
+            .decoded
+            .filter(|_| input.mode.is_polarized())
+            .and_then(diagnosis::degree_of_polarization),
         noise: input.decoded.map(|decoded| NoiseReport {
             model: decoded.noise,
             estimated: decoded.noise_estimated,
@@ -263,6 +270,8 @@ fn capture(input: &ReportInput) -> CaptureReport {
         hold_frames: known.map(|capture| capture.hold_frames),
         timing_measured: known.map(|capture| capture.timing_measured),
         retaken: known.map(|capture| capture.retaken.clone()).unwrap_or_default(),
+        references_retaken: known.map(|capture| capture.references_retaken.clone()).unwrap_or_default(),
+        discarded: known.map(|capture| capture.discarded.clone()).unwrap_or_default(),
         pair_residual_sigma: input.decoded.and_then(|decoded| pair_residual(&decoded.pairs)),
         drift: input.decoded.and_then(|decoded| decoded.drift).and_then(statistics::finite),
     }

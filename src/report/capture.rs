@@ -4,7 +4,7 @@ use polscan_drivers::{camera::StreamStatistics, frame::FrameStamp, projector::Pr
 use polscan_patterns::Role;
 use serde::{Deserialize, Serialize};
 
-use crate::sequencer::{CaptureRecord, Retake};
+use crate::sequencer::{CaptureRecord, Finding, ReferenceRetake, Retake};
 
 /// A capture without its pixels.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
@@ -21,6 +21,12 @@ pub struct CaptureSummary {
     pub timing_measured: bool,
     /// Pairs that were captured again.
     pub retaken: Vec<Retake>,
+    /// References that were captured again.
+    #[serde(default)]
+    pub references_retaken: Vec<ReferenceRetake>,
+    /// Frames that arrived and were not the ones awaited.
+    #[serde(default)]
+    pub discarded: Vec<Finding>,
     /// Counters of the camera's stream.
     pub statistics: StreamStatistics,
     /// Frames whose exposure began before their own picture was flipped: they show the picture before.
@@ -40,6 +46,8 @@ impl From<&CaptureRecord> for CaptureSummary {
             hold_frames: record.hold_refreshes,
             timing_measured: record.timing_measured,
             retaken: record.retaken.clone(),
+            references_retaken: record.notes.references_retaken.clone(),
+            discarded: record.notes.discarded.clone(),
             statistics: record.statistics,
             early: Vec::new(),
             shared_slide: Vec::new(),

@@ -7,7 +7,7 @@ pub mod colormap;
 mod diagnosis;
 pub mod pictures;
 mod region;
-mod statistics;
+pub(crate) mod statistics;
 mod summary;
 #[cfg(test)]
 mod testing;

@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use super::{Accuracy, Reason, Verdict};
 use crate::{
     decode::{NoiseModel, PairResidual},
-    sequencer::Retake,
+    sequencer::{Finding, ReferenceRetake, Retake},
 };
 
 /// Schema of the report.
@@ -50,6 +50,10 @@ pub struct Report {
     pub truth: Option<TruthReport>,
     /// Agreement of rows with the calibration; `null` without rows or calibration.
     pub row_check: Option<RowCheckReport>,
+    /// Degree of linear polarization of the lit pixels, weighed by brightness: `(r - 1) / (r + 1)` for an extinction ratio
+    /// r. `null` in mode gray, and where nothing was lit.
+    #[serde(default)]
+    pub degree_of_polarization: Option<f64>,
     /// Noise of the camera as it was used; `null` where nothing was decoded.
     pub noise: Option<NoiseReport>,
     /// What missing frames cost, in words.
@@ -124,6 +128,12 @@ pub struct CaptureReport {
     pub timing_measured: Option<bool>,
     /// Pairs that were captured again.
     pub retaken: Vec<Retake>,
+    /// References that were captured again.
+    #[serde(default)]
+    pub references_retaken: Vec<ReferenceRetake>,
+    /// Frames that arrived, were not the ones awaited, and were dropped.
+    #[serde(default)]
+    pub discarded: Vec<Finding>,
     /// Residual of the pair sums. `null` where there was no pair to sum.
     pub pair_residual_sigma: Option<PairResidualReport>,
     /// Last minus first reference, as a share of the modulation. `null` where there is one reference only.

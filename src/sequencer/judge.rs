@@ -3,7 +3,7 @@
 //! The causes named here are the likely ones, as far as the statistics of one pair can tell; the evidence is written
 //! out beside each, so that a person can judge again.
 
-use polscan_drivers::frame::Frame;
+use polscan_drivers::frame::{Frame, Pixels};
 use polscan_patterns::{Axis, Role};
 use serde::{Deserialize, Serialize};
 
@@ -60,7 +60,9 @@ pub struct PairThresholds {
     pub stale_share: f64,
     /// Below this share of outliers something small moved.
     pub motion_share: f64,
-    /// From this proportional change between two frames of one reference on, they show different pictures.
+    /// From this change of brightness between two frames of one reference on, as a share of their mean, they show
+    /// different pictures: 1.4 is a factor of 5.7, more than automatic exposure changes and less than lies between the two
+    /// references of a rig with an extinction of 10:1.
     pub stale_gain: f64,
     /// Share of edge pixels beyond 5 sigma that is called a non-linear response.
     pub edge_outliers: f64,
@@ -84,7 +86,7 @@ impl Default for PairThresholds {
             flat_outliers: 0.005,
             stale_share: 0.2,
             motion_share: 0.02,
-            stale_gain: 0.3,
+            stale_gain: 1.4,
             edge_outliers: 0.02,
             edge_ratio: 10.0,
             median_degraded: 1.0,
@@ -163,7 +165,7 @@ pub struct ReferenceChange {
     pub offset_dn: f64,
     /// 1.4826 times the median absolute deviation of what gain and offset leave, in units of its noise.
     pub sigma: f64,
-    /// Share of pixels that differ by more than 5 sigma from what gain and offset say.
+    /// Share of pixels that differ, together with the pixel beside them, by more than 5 sigma from what gain and offset say.
     pub outliers: f64,
     /// Number of pixels looked at.
     pub pixels: u64,
@@ -176,22 +178,39 @@ pub fn compare_references(
     camera: &CameraResponse,
     noise: NoiseModel,
 ) -> Option<ReferenceChange> {
-    let (before, after) = (first.pixels(), last.pixels());
-    if (first.width, first.height) != (last.width, last.height) || before.len() != after.len() {
+    let same = (first.width, first.height) == (last.width, last.height);
+    same.then(|| compare_pixels(first.pixels(), last.pixels(), camera, noise)).flatten()
+}
+
+/// The same for bare pixels.
+pub(crate) fn compare_pixels(
+    before: Pixels<'_>,
+    after: Pixels<'_>,
+    camera: &CameraResponse,
+    noise: NoiseModel,
+) -> Option<ReferenceChange> {
+    if before.len() != after.len() {
         return None;
     }
     let black = camera.black_level_dn.unwrap_or(0.0);
     // A quarter of a million pixels, evenly spread, fix the median to a thousandth of a sigma.
     let stride = (before.len() / 250_000).max(1);
-    let mut samples: Vec<Change> = (0..before.len())
-        .step_by(stride)
-        .map(|index| (before.get(index), after.get(index)))
-        .filter(|&(a, b)| a < camera.saturation_dn && b < camera.saturation_dn)
-        .map(|(a, b)| {
+    let sample = |index: usize| {
+        let (a, b) = (before.get(index), after.get(index));
+        (a < camera.saturation_dn && b < camera.saturation_dn).then(|| {
             let (a, b) = (f64::from(a) - black, f64::from(b) - black);
             // One level for both keeps the noise of the difference free of its sign.
             let level = (a + b) / 2.0;
-            Change { level, change: b - a, noise: (2.0 * noise.variance(level)).sqrt() }
+            Sample { level, change: b - a, noise: (2.0 * noise.variance(level)).sqrt() }
+        })
+    };
+    let mut samples: Vec<Change> = (0..before.len())
+        .step_by(stride)
+        .filter_map(|index| {
+            let Sample { level, change, noise } = sample(index)?;
+            // The last pixel of a row has the first of the next beside it: as good as any.
+            let beside = if index + 1 < before.len() { index + 1 } else { index.saturating_sub(1) };
+            Some(Change { level, change, noise, beside: sample(beside)? })
         })
         .collect();
     if samples.is_empty() {
@@ -205,18 +224,37 @@ pub fn compare_references(
     let level_dn = median_of(&mut samples.iter().map(|sample| sample.level).collect::<Vec<_>>());
     let (gain, offset_dn) = gain_and_offset(&mut samples);
     let slope = if gain.is_nan() { 0.0 } else { gain };
-    let mut rest: Vec<f64> =
-        samples.iter().map(|s| ((s.change - slope * s.level - offset_dn) / s.noise).abs()).collect();
-    let outliers = rest.iter().filter(|&&value| value > 5.0).count() as f64 / count;
+    let left = |s: &Sample| (s.change - slope * s.level - offset_dn) / s.noise;
+    // What moves or shows another picture changes neighbours alike; noise that is larger than assumed does not.
+    let is_outlier = |s: &&Change| {
+        let (here, beside) = (left(&s.here()), left(&s.beside));
+        here.abs() > 5.0 && beside.abs() > 5.0 && here * beside > 0.0
+    };
+    let outliers = samples.iter().filter(is_outlier).count() as f64 / count;
+    let mut rest: Vec<f64> = samples.iter().map(|s| left(&s.here()).abs()).collect();
     let sigma = 1.4826 * median_of(&mut rest);
     Some(ReferenceChange { median, level_dn, gain, offset_dn, sigma, outliers, pixels: samples.len() as u64 })
 }
 
 /// One pixel of two frames, in DN.
+struct Sample {
+    level: f64,
+    change: f64,
+    noise: f64,
+}
+
+/// The same with the pixel beside it.
 struct Change {
     level: f64,
     change: f64,
     noise: f64,
+    beside: Sample,
+}
+
+impl Change {
+    fn here(&self) -> Sample {
+        Sample { level: self.level, change: self.change, noise: self.noise }
+    }
 }
 
 /// Line through the medians of level and change of the darkest and the brightest quarter. Sorts the samples.

@@ -94,6 +94,8 @@ pub struct Machine {
     references_hold: bool,
     refused_pairs: u32,
     references_repeated: bool,
+    /// Reasons for which a pair has been taken again in vain.
+    lasting: Vec<String>,
 }
 
 impl Machine {
@@ -119,6 +121,7 @@ impl Machine {
             references_hold: false,
             refused_pairs: 0,
             references_repeated: false,
+            lasting: Vec::new(),
         }
     }
 
@@ -324,6 +327,13 @@ impl Machine {
                 self.findings.push(finding(suspicion));
                 vec![Action::Accept { group }]
             }
+            // Light that stays changed: another try would show the same, and the decode stands.
+            PairVerdict::Retake(suspicion)
+                if is_of_the_light(&suspicion) && !self.may_help(group, &suspicion) =>
+            {
+                self.findings.push(finding(suspicion));
+                vec![Action::Accept { group }]
+            }
             PairVerdict::Retake(suspicion) if self.may_repeat(group) => {
                 self.repeat_judged(subject, suspicion)
             }
@@ -427,6 +437,15 @@ impl Machine {
         }
     }
 
+    /// Whether another try may bring a picture in better light. Notes where one was in vain.
+    fn may_help(&mut self, group: usize, suspicion: &Suspicion) -> bool {
+        let in_vain = self.retaken.iter().any(|take| take.group == group && take.reason == suspicion.reason);
+        if in_vain && !self.lasting.contains(&suspicion.reason) {
+            self.lasting.push(suspicion.reason.clone());
+        }
+        self.may_repeat(group) && !self.lasting.contains(&suspicion.reason)
+    }
+
     fn may_repeat(&self, group: usize) -> bool {
         self.attempts[group] < self.retakes_each && self.retaken.len() < self.retakes_total as usize
     }
@@ -456,6 +475,11 @@ impl Machine {
         self.phase = Phase::Ended;
         vec![Action::Black, Action::Finish(outcome)]
     }
+}
+
+/// Whether the frames show what was asked for in another light.
+fn is_of_the_light(suspicion: &Suspicion) -> bool {
+    matches!(suspicion.reason.as_str(), "flicker" | "ambient-drift" | "exposure-drift")
 }
 
 /// Whether a frame is not the one that was asked for: as a reference it would spoil the mean of the good ones.

@@ -12,6 +12,7 @@ mod record;
 
 pub use capture::{CancelFlag, Progress, capture, slide};
 pub use failure::{CaptureError, CaptureFailure, PartialCapture};
+pub(crate) use judge::compare_pixels;
 pub use judge::{
     Judge, PairThresholds, PairVerdict, ReferenceChange, Suspicion, compare_references, drift_rule,
     judge_rule,

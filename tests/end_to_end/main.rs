@@ -2,6 +2,9 @@
 
 mod bad_input;
 mod captures_of_the_twin;
+#[path = "../faults/cases.rs"]
+#[allow(dead_code)]
+mod cases;
 mod compare;
 mod faults;
 mod patterns;

@@ -9,9 +9,6 @@ use std::{
 use serde_json::Value;
 use toml::Table;
 
-/// Sizes and focal lengths are divided by this; three camera pixels still see one projector pixel.
-const SCALE: f64 = 4.0;
-
 /// A configuration that a test may change before it runs the program.
 pub struct Rig {
     folder: tempfile::TempDir,
@@ -21,13 +18,18 @@ pub struct Rig {
 impl Rig {
     /// The paper's rig, a quarter of its size.
     pub fn small() -> Self {
+        Self::scaled(4.0)
+    }
+
+    /// The paper's rig with sizes and focal lengths divided by `scale`: the same camera pixels see one projector pixel.
+    pub fn scaled(scale: f64) -> Self {
         let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("config");
         let folder = tempfile::tempdir().expect("a folder for the rig");
         let mut config = table(&root.join("sim.toml"));
         let mut calibration = table(&root.join("sim-calibration.toml"));
         for device in ["camera", "projector"] {
-            shrink_description(at(&mut config, &["sim", device]));
-            shrink_lens(at(&mut calibration, &[device]));
+            shrink_description(at(&mut config, &["sim", device]), scale);
+            shrink_lens(at(&mut calibration, &[device]), scale);
         }
         let text = toml::to_string(&calibration).expect("a table is TOML");
         fs::write(folder.path().join("sim-calibration.toml"), text).expect("the calibration is written");
@@ -45,6 +47,16 @@ impl Rig {
         let (path, name) = key.rsplit_once('.').expect("a key has a table");
         let path: Vec<&str> = path.split('.').collect();
         at(&mut self.config, &path).insert(name.into(), value.into());
+        self
+    }
+
+    /// Adds an entry to `[[sim.faults]]`, given as an inline table.
+    pub fn fault(mut self, entry: &str) -> Self {
+        let entry: Table =
+            toml::from_str::<Table>(&format!("fault = {{ {entry} }}")).expect("an inline table");
+        let sim = at(&mut self.config, &["sim"]);
+        let faults = sim.entry("faults").or_insert_with(|| toml::Value::Array(Vec::new()));
+        faults.as_array_mut().expect("a list of faults").push(entry["fault"].clone());
         self
     }
 
@@ -159,34 +171,34 @@ fn at<'a>(table: &'a mut Table, path: &[&str]) -> &'a mut Table {
     })
 }
 
-fn shrink_size(table: &mut Table) {
+fn shrink_size(table: &mut Table, scale: f64) {
     for side in table["size"].as_array_mut().expect("a size has two sides") {
-        *side = ((side.as_integer().expect("a side in pixels") as f64 / SCALE) as i64).into();
+        *side = ((side.as_integer().expect("a side in pixels") as f64 / scale) as i64).into();
     }
 }
 
 /// Pixel centres lie at integers, so that a coordinate shrinks about -1/2.
-fn shrink_coordinate(value: &mut toml::Value) {
+fn shrink_coordinate(value: &mut toml::Value, scale: f64) {
     let number = value.as_float().expect("a coordinate in pixels");
-    *value = ((number + 0.5) / SCALE - 0.5).into();
+    *value = ((number + 0.5) / scale - 0.5).into();
 }
 
-fn shrink_description(device: &mut Table) {
-    shrink_size(device);
+fn shrink_description(device: &mut Table, scale: f64) {
+    shrink_size(device, scale);
     let focal_px = device["focal_px"].as_float().expect("a focal length");
-    device.insert("focal_px".into(), (focal_px / SCALE).into());
+    device.insert("focal_px".into(), (focal_px / scale).into());
     if let Some(point) = device.get_mut("principal_point_px") {
-        point.as_array_mut().expect("a point").iter_mut().for_each(shrink_coordinate);
+        point.as_array_mut().expect("a point").iter_mut().for_each(|value| shrink_coordinate(value, scale));
     }
 }
 
-fn shrink_lens(lens: &mut Table) {
-    shrink_size(lens);
+fn shrink_lens(lens: &mut Table, scale: f64) {
+    shrink_size(lens, scale);
     let rows = lens["matrix"].as_array_mut().expect("a matrix has rows");
     for (index, row) in rows.iter_mut().take(2).enumerate() {
         let row = row.as_array_mut().expect("a row of a matrix");
         let focal_px = row[index].as_float().expect("a focal length");
-        row[index] = (focal_px / SCALE).into();
-        shrink_coordinate(&mut row[2]);
+        row[index] = (focal_px / scale).into();
+        shrink_coordinate(&mut row[2], scale);
     }
 }

@@ -6,6 +6,7 @@ use super::{
     description::{CameraDescription, Pacing},
     render::{Exposure, Response, full_scale_dn},
     rig::{Device, Shared, Taken},
+    script::Delivered,
     worker::{Delivery, Job, Worker},
 };
 use crate::{
@@ -15,16 +16,16 @@ use crate::{
     },
     clock::Timestamp,
     error::DeviceError,
-    frame::{Frame, FrameStamp},
+    frame::{Frame, FrameStamp, PixelStore, Pixels},
 };
 
 const SERIAL: &str = "sim-camera-0";
 const MODEL: &str = "simulated monochrome camera";
 const SHORTEST_EXPOSURE_US: f64 = 1.0;
 const LONGEST_EXPOSURE_US: f64 = 30e6;
-/// Exposure times are whole multiples of this.
 /// A clipped pixel reads this many sigma of read noise low once in some million samples.
 const SATURATION_MARGIN_SIGMA: f64 = 5.0;
+/// Exposure times are whole multiples of this.
 const EXPOSURE_STEP_US: f64 = 1.0;
 const HIGHEST_GAIN_DB: f64 = 48.0;
 
@@ -79,6 +80,10 @@ struct Stream {
     /// End of the latest exposure.
     busy_until: Option<Timestamp>,
     pending: Pending,
+    /// Pixels of the latest exposure that was read out, whatever became of it.
+    before: Option<Arc<dyn PixelStore>>,
+    /// A frame that will be delivered again.
+    again: Option<Frame>,
 }
 
 /// Exposures that have not been delivered.
@@ -87,6 +92,56 @@ enum Pending {
     Virtual(VecDeque<Job>),
     /// Rendered on a thread of their own while time goes on.
     Real(Worker),
+}
+
+impl Stream {
+    /// The frame of an exposure that was read out; `None` where it is lost on the way.
+    fn deliver(&mut self, delivery: Delivery, shared: &Shared) -> Option<Frame> {
+        let Delivery { job, received, store } = delivery;
+        let fate = shared.script.delivered(job.trigger);
+        let before = self.before.replace(store.clone()).unwrap_or_else(|| store.clone());
+        let store = match fate {
+            Delivered::Never => return None,
+            Delivered::Whole | Delivered::Twice => store,
+            Delivered::Stale => before,
+            Delivered::Torn(row) => {
+                torn(&*store, &*before, row as usize * self.response.region.width as usize)
+            }
+        };
+        self.statistics.frames += 1;
+        let frame = Frame {
+            width: self.response.region.width,
+            height: self.response.region.height,
+            bit_depth: self.response.bits,
+            stamp: FrameStamp {
+                frame_id: job.trigger,
+                trigger: job.trigger,
+                exposure_start: job.start,
+                received,
+                device_time_ns: Some(job.start.0),
+            },
+            store,
+        };
+        if fate == Delivered::Twice {
+            self.again = Some(frame.clone());
+        }
+        Some(frame)
+    }
+}
+
+/// The samples of `new` up to `from`, of `old` from there on.
+fn torn(new: &dyn PixelStore, old: &dyn PixelStore, from: usize) -> Arc<dyn PixelStore> {
+    match (new.pixels(), old.pixels()) {
+        (Pixels::U8(new), Pixels::U8(old)) => {
+            let from = from.min(new.len());
+            Arc::new([&new[..from], &old[from..]].concat())
+        }
+        (Pixels::U16(new), Pixels::U16(old)) => {
+            let from = from.min(new.len());
+            Arc::new([&new[..from], &old[from..]].concat())
+        }
+        _ => unreachable!("frames of one stream have one sample type"),
+    }
 }
 
 impl SimCamera {
@@ -134,13 +189,14 @@ fn response(
     settings: &CameraSettings,
     region: Region,
     exposure_us: f64,
+    hidden_gamma: f64,
 ) -> Response {
     let bits = settings.format.bit_depth();
     let full_scale = f64::from(full_scale_dn(bits));
     let black_dn = camera.black_level_share * full_scale;
     // At 0 dB the full well just fills the converter.
     let dn_per_electron = (full_scale - black_dn) / camera.full_well_e * 10f64.powf(settings.gain_db / 20.0);
-    Response { region, bits, dn_per_electron, black_dn, gamma: camera.gamma, exposure_us }
+    Response { region, bits, dn_per_electron, black_dn, gamma: camera.gamma * hidden_gamma, exposure_us }
 }
 
 /// Least value of a sample whose pixel may have been full. Read noise comes after the pixel is full, so that a clipped
@@ -186,7 +242,8 @@ impl Camera for SimCamera {
         }
         let region = self.region(settings.region)?;
         let exposure_us = (exposure / EXPOSURE_STEP_US).round() * EXPOSURE_STEP_US;
-        let response = response(camera, settings, region, exposure_us);
+        let hidden_gamma = self.shared().script.hidden_gamma();
+        let response = response(camera, settings, region, exposure_us, hidden_gamma);
         let noise = (camera.gamma == 1.0).then_some(CameraNoise {
             gain_dn_per_electron: response.dn_per_electron,
             read_noise_dn: camera.read_noise_e * response.dn_per_electron,
@@ -217,8 +274,15 @@ impl Camera for SimCamera {
             Pacing::Fast => Pending::Virtual(VecDeque::new()),
             Pacing::RealTime => Pending::Real(Worker::start(self.shared().clone(), response.clone())?),
         };
-        self.stream =
-            Some(Stream { response, statistics: StreamStatistics::default(), busy_until: None, pending });
+        self.shared().arm();
+        self.stream = Some(Stream {
+            response,
+            statistics: StreamStatistics::default(),
+            busy_until: None,
+            pending,
+            before: None,
+            again: None,
+        });
         Ok(())
     }
 
@@ -227,7 +291,8 @@ impl Camera for SimCamera {
         let Some(stream) = &mut self.stream else {
             return Err(self.out_of_order("trigger", "not armed"));
         };
-        let exposure = Duration::from_secs_f64(1e-6 * stream.response.exposure_us);
+        let exposure =
+            Duration::from_secs_f64(1e-6 * stream.response.exposure_us * shared.automatic_factor());
         let readout = Duration::from_secs_f64(1e-6 * shared.description.camera.readout_us);
         let mut timeline = shared.timeline();
         // The sensor reads one frame out while it exposes the next, but not two at once.
@@ -242,7 +307,8 @@ impl Camera for SimCamera {
         let trigger = stream.statistics.triggers;
         stream.statistics.triggers += 1;
         stream.busy_until = Some(end);
-        let job = Job { number, trigger, start, end, arrives: end + readout };
+        let arrives = end + readout + Duration::from_secs_f64(shared.script.delay_s(trigger));
+        let job = Job { number, trigger, start, end, arrives };
         match &mut stream.pending {
             Pending::Virtual(jobs) => jobs.push_back(job),
             Pending::Real(worker) => worker.send(job)?,
@@ -255,33 +321,28 @@ impl Camera for SimCamera {
         let Some(stream) = &mut self.stream else {
             return Err(self.out_of_order("next_frame", "not armed"));
         };
-        let delivery = match &mut stream.pending {
-            Pending::Virtual(jobs) => next_virtual(&shared, &stream.response, jobs, timeout),
-            Pending::Real(worker) => worker.next(&shared, timeout),
-        };
-        let Some(Delivery { job, received, store }) = delivery? else {
-            return Err(DeviceError::Timeout {
-                device: self.info.serial.clone(),
-                awaited: "frame",
-                timeout_ms: timeout.as_millis() as u64,
-            });
-        };
-        // Scripted faults of the camera (frames that are lost, late, repeated or damaged) belong here, between the
-        // rendered exposure and its delivery.
-        stream.statistics.frames += 1;
-        Ok(Frame {
-            width: stream.response.region.width,
-            height: stream.response.region.height,
-            bit_depth: stream.response.bits,
-            stamp: FrameStamp {
-                frame_id: job.trigger,
-                trigger: job.trigger,
-                exposure_start: job.start,
-                received,
-                device_time_ns: Some(job.start.0),
-            },
-            store,
-        })
+        if let Some(frame) = stream.again.take() {
+            stream.statistics.frames += 1;
+            return Ok(frame);
+        }
+        let deadline = shared.clock.now() + timeout;
+        loop {
+            let left = deadline.since(shared.clock.now());
+            let delivery = match &mut stream.pending {
+                Pending::Virtual(jobs) => next_virtual(&shared, &stream.response, jobs, left),
+                Pending::Real(worker) => worker.next(&shared, left),
+            };
+            let Some(delivery) = delivery? else {
+                return Err(DeviceError::Timeout {
+                    device: self.info.serial.clone(),
+                    awaited: "frame",
+                    timeout_ms: timeout.as_millis() as u64,
+                });
+            };
+            if let Some(frame) = stream.deliver(delivery, &shared) {
+                return Ok(frame);
+            }
+        }
     }
 
     fn disarm(&mut self) -> Result<StreamStatistics, DeviceError> {
@@ -325,12 +386,30 @@ fn next_virtual(
 }
 
 /// Renders an exposure that lies in the past.
-pub(crate) fn expose(shared: &Shared, response: &Response, job: &Job) -> Arc<dyn crate::frame::PixelStore> {
-    let light = {
+pub(crate) fn expose(shared: &Shared, response: &Response, job: &Job) -> Arc<dyn PixelStore> {
+    let exposure = {
         let mut timeline = shared.timeline();
         let light = timeline.mixture(job.start, job.end);
         timeline.dismiss(job.number);
-        light
+        let middle = Timestamp(job.start.0 + (job.end.0 - job.start.0) / 2);
+        let since_ns = timeline.since_armed_ns(middle);
+        let ambient_e = shared.script.ambient_e(since_ns, shared.description.ambient.electrons);
+        let bumped = shared.script.bump().is_some_and(|(at_ns, _)| since_ns >= at_ns as f64);
+        Exposure { number: job.number, light, ambient_e, bumped }
     };
-    shared.renderer.render(&Exposure { number: job.number, light }, response)
+    if shared.script.auto_exposure().is_none() {
+        return shared.renderer.render(&exposure, response);
+    }
+    let exposure_us = 1e6 * job.end.since(job.start).as_secs_f64();
+    let store = shared.renderer.render(&exposure, &Response { exposure_us, ..response.clone() });
+    let full_scale = f64::from(response.full_scale_dn());
+    shared.meter((mean_dn(store.pixels()) - response.black_dn) / (full_scale - response.black_dn));
+    store
+}
+
+/// Mean of some ten thousand samples.
+fn mean_dn(pixels: Pixels<'_>) -> f64 {
+    let step = (pixels.len() / 10_000).max(1);
+    let samples = (0..pixels.len()).step_by(step).map(|index| f64::from(pixels.get(index)));
+    samples.sum::<f64>() / pixels.len().div_ceil(step).max(1) as f64
 }

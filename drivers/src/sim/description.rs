@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 
-use super::{faults::Faults, panel::WIDEST_BLUR_PX};
+use super::{faults::Faults, panel::WIDEST_BLUR_PX, script::FaultDescription};
 use crate::clock::{Clock, MonotonicClock, VirtualClock};
 
 /// A simulated rig. Lengths in mm in the camera's frame (x right, y down, z forward), pixel centres at integers,
@@ -33,6 +33,9 @@ pub struct RigDescription {
     pub ambient: AmbientDescription,
     /// Flicker of the projector's lamp; absent for none.
     pub flicker: Option<FlickerDescription>,
+    /// What goes wrong; nothing by default.
+    #[serde(default)]
+    pub faults: Vec<FaultDescription>,
 }
 
 fn one_seed() -> u64 {
@@ -277,6 +280,9 @@ impl RigDescription {
         if let Some(flicker) = &self.flicker {
             faults.within("flicker.share", flicker.share, 0.0, 1.0);
             faults.above("flicker.hz", flicker.hz, 0.0);
+        }
+        for (number, fault) in self.faults.iter().enumerate() {
+            fault.validate(&mut faults, &format!("faults[{number}]"));
         }
         faults.into_list()
     }

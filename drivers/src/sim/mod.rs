@@ -20,9 +20,10 @@
 //! regions or the time of day. A fresh rig therefore repeats a scan bit by bit, and a second take on the same rig differs
 //! from the first.
 //!
-//! A rig simulates devices that behave. Faults of the display would come between a request and the timeline
-//! (`projector.rs`, `flip`), faults of the camera between a rendered exposure and its delivery (`camera.rs`,
-//! `next_frame`).
+//! A rig simulates devices that behave, unless its description lists faults ([`FaultDescription`]). Each then happens at
+//! its own place: those of the display between a request and the timeline (`projector.rs`, `timeline.rs`), of the camera
+//! at the sensor (`render.rs`) or between a rendered exposure and its delivery (`camera.rs`), of the scene by a second
+//! look at it (`world.rs`). The panel changes as a whole: the scan-out of a picture from top to bottom is not modelled.
 
 mod camera;
 mod description;
@@ -35,6 +36,7 @@ mod projector;
 mod render;
 mod rig;
 mod scene;
+mod script;
 mod surface;
 #[cfg(test)]
 mod testing;
@@ -50,3 +52,4 @@ pub use description::{
 pub use projector::SimProjectors;
 pub use rig::{Rig, RigError, Truth, TruthObject};
 pub use scene::{Material, Object, Plane, Scene, Shape, Sphere, Step, VGroove, Wedge};
+pub use script::FaultDescription;

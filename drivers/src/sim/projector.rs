@@ -2,7 +2,10 @@
 
 use std::{sync::Arc, time::Duration};
 
-use super::rig::{Device, Shared, Taken};
+use super::{
+    rig::{Device, Shared, Taken},
+    timeline::settling_s,
+};
 use crate::{
     camera::Listing,
     error::DeviceError,
@@ -56,8 +59,8 @@ impl SimProjector {
         let projector = &taken.shared.description.projector;
         let timeline = taken.shared.timeline();
         let timing = projector.states_timing.then(|| ProjectorTiming {
-            latency: Duration::from_nanos(timeline.latency_ns()),
-            settling: Duration::from_secs_f64(timeline.settling_s(SETTLED_SHARE)),
+            latency: Duration::from_nanos(u64::from(projector.latency_refreshes) * timeline.period_ns()),
+            settling: Duration::from_secs_f64(settling_s(projector.lcd_10_90_ms, SETTLED_SHARE)),
         });
         let info = ProjectorInfo {
             driver: "sim".to_owned(),
@@ -72,8 +75,7 @@ impl SimProjector {
         Self { taken, info, slides: None }
     }
 
-    /// Flips at the next refresh and waits for it. Scripted faults of the display (a flip that is late, lost or torn)
-    /// belong here, between the request and the timeline.
+    /// Flips at the next refresh and waits for it. The receipt tells what was asked for, `slide` is what is shown.
     fn flip(&mut self, index: Option<u32>, slide: Option<Arc<Slide>>) -> PresentReceipt {
         let shared = &self.taken.shared;
         let (refresh, flipped) = {
@@ -107,10 +109,9 @@ impl Projector for SimProjector {
                 state: "no slides are loaded",
             });
         };
-        let slide = slides
-            .get(index as usize)
-            .cloned()
-            .ok_or_else(|| no_such_slide(&self.info, index, slides.len()))?;
+        let shown = self.taken.shared.script.shown(index, slides.len() as u32);
+        let asked = slides.get(index as usize).and_then(|_| slides.get(shown as usize));
+        let slide = asked.cloned().ok_or_else(|| no_such_slide(&self.info, index, slides.len()))?;
         Ok(self.flip(Some(index), Some(slide)))
     }
 

@@ -8,6 +8,7 @@ use super::{
     description::{CameraDescription, RigDescription},
     noise::Stream,
     panel::{Channels, Illumination, Mixture, Panel, blurred_box, reach_px},
+    script::Script,
     world::{View, World},
 };
 use crate::{
@@ -51,15 +52,21 @@ pub(crate) struct Exposure {
     pub(crate) number: u64,
     /// Slides, weights in seconds of the mean lamp.
     pub(crate) light: Mixture,
+    /// Ambient light, in electrons at the reference exposure.
+    pub(crate) ambient_e: f64,
+    /// Whether something has been bumped before it.
+    pub(crate) bumped: bool,
 }
 
 /// Renders exposures of one world.
 #[derive(Debug)]
 pub(crate) struct Renderer {
     world: World,
+    /// The same after a bump.
+    bumped: Option<World>,
     panel: Panel,
     camera: CameraDescription,
-    ambient_e: f64,
+    script: Script,
     seed: u64,
     /// The camera's blur at whole pixels, symmetric, sum 1.
     kernel: Vec<f32>,
@@ -71,7 +78,13 @@ pub(crate) struct Renderer {
 }
 
 impl Renderer {
-    pub(crate) fn new(description: &RigDescription, world: World, panel: Panel) -> Self {
+    pub(crate) fn new(
+        description: &RigDescription,
+        world: World,
+        bumped: Option<World>,
+        panel: Panel,
+        script: &Script,
+    ) -> Self {
         let camera = description.camera.clone();
         let kernel = kernel(camera.blur_px);
         debug_assert_eq!(kernel.len(), 2 * world.border + 1);
@@ -88,9 +101,10 @@ impl Renderer {
         });
         Self {
             world,
+            bumped,
             panel,
             camera,
-            ambient_e: description.ambient.electrons,
+            script: script.clone(),
             seed: description.seed,
             kernel,
             pattern,
@@ -128,7 +142,7 @@ impl Renderer {
         self.blurred_rows(exposure, response, &mut plane);
         let width = response.region.width as usize;
         let stream = Stream::new(self.seed, exposure.number);
-        let developer = Developer::new(self, response);
+        let developer = Developer::new(&self.camera, exposure.ambient_e, response);
         samples.par_chunks_mut(width).enumerate().for_each_init(
             || vec![0.0f32; width],
             |row, (y, out)| {
@@ -137,10 +151,11 @@ impl Renderer {
                     let source = &plane[(y + offset) * width..(y + offset + 1) * width];
                     row.iter_mut().zip(source).for_each(|(sum, light)| *sum += weight * light);
                 }
-                let first = (u64::from(response.region.y) + y as u64) * u64::from(self.camera.size[0])
-                    + u64::from(response.region.x);
+                let sensor_row = response.region.y + y as u32;
+                let first =
+                    u64::from(sensor_row) * u64::from(self.camera.size[0]) + u64::from(response.region.x);
                 let pattern = self.pattern.as_ref().map(|pattern| &pattern[first as usize..][..width]);
-                developer.develop(stream, first, row, pattern);
+                developer.develop(stream, first, row, pattern, self.script.is_dead(sensor_row));
                 out.iter_mut().zip(row.iter()).for_each(|(out, dn)| *out = sample(*dn));
             },
         );
@@ -150,7 +165,11 @@ impl Renderer {
     fn blurred_rows(&self, exposure: &Exposure, response: &Response, plane: &mut Vec<f32>) {
         let Region { x, y, width, height } = response.region;
         let [x, y, width, height] = [x, y, width, height].map(|value| value as usize);
-        let border = self.world.border;
+        let world = match (&self.bumped, exposure.bumped) {
+            (Some(bumped), true) => bumped,
+            _ => &self.world,
+        };
+        let border = world.border;
         let (wide, tall) = (width + 2 * border, height + 2 * border);
         let reference_s = 1e-6 * self.camera.reference_exposure_us;
         let light: Mixture =
@@ -160,8 +179,8 @@ impl Renderer {
         plane.par_chunks_mut(width).enumerate().for_each_init(
             || vec![0.0f32; wide],
             |row, (line, out)| {
-                let start = (y + line) * self.world.width + x;
-                light_row(&illumination, &self.world.views[start..start + wide], row);
+                let start = (y + line) * world.width + x;
+                light_row(&illumination, &world.views[start..start + wide], row);
                 out.fill(0.0);
                 for (offset, weight) in self.kernel.iter().enumerate() {
                     out.iter_mut().zip(&row[offset..]).for_each(|(sum, light)| *sum += weight * light);
@@ -220,9 +239,8 @@ struct Developer {
 }
 
 impl Developer {
-    fn new(renderer: &Renderer, response: &Response) -> Self {
-        let camera = &renderer.camera;
-        let background = renderer.ambient_e * response.exposure_us / camera.reference_exposure_us
+    fn new(camera: &CameraDescription, ambient_e: f64, response: &Response) -> Self {
+        let background = ambient_e * response.exposure_us / camera.reference_exposure_us
             + camera.dark_current_e_per_s * 1e-6 * response.exposure_us;
         let full_scale = f64::from(response.full_scale_dn());
         let white_e = (full_scale - response.black_dn) / response.dn_per_electron;
@@ -237,9 +255,18 @@ impl Developer {
         }
     }
 
-    /// Turns mean electrons of light into samples in DN, clipped but not yet cut to whole numbers.
-    fn develop(&self, stream: Stream, first_pixel: u64, row: &mut [f32], pattern: Option<&[[f32; 2]]>) {
+    /// Turns mean electrons of light into samples in DN, clipped but not yet cut to whole numbers. A `dead` row collects
+    /// none.
+    fn develop(
+        &self,
+        stream: Stream,
+        first_pixel: u64,
+        row: &mut [f32],
+        pattern: Option<&[[f32; 2]]>,
+        dead: bool,
+    ) {
         match pattern {
+            _ if dead => row.fill(0.0),
             None => row.iter_mut().for_each(|light| *light = (*light + self.background_e).max(0.0)),
             Some(pattern) => row.iter_mut().zip(pattern).for_each(|(light, [sensitivity, _])| {
                 *light = (*light * sensitivity + self.background_e).max(0.0);

@@ -9,7 +9,7 @@ use thiserror::Error;
 
 use super::{
     camera::SimCameras, description::RigDescription, panel::Panel, projector::SimProjectors,
-    render::Renderer, scene::Scene, timeline::Timeline, world::World,
+    render::Renderer, scene::Scene, script::Script, timeline::Timeline, world::World,
 };
 use crate::{camera::Region, clock::Clock, error::DeviceError};
 
@@ -73,12 +73,19 @@ pub struct TruthObject {
     pub planar: bool,
 }
 
+/// Range of automatic exposure, as factors of the exposure time that was applied.
+const SHORTEST_AUTOMATIC: f64 = 0.1;
+const LONGEST_AUTOMATIC: f64 = 4.0;
+
 /// What camera, projector and rig share.
 #[derive(Debug)]
 pub(crate) struct Shared {
     pub(crate) description: RigDescription,
     pub(crate) clock: Arc<dyn Clock>,
     pub(crate) renderer: Renderer,
+    pub(crate) script: Script,
+    /// Factor that automatic exposure, where there is one, puts on the exposure time.
+    automatic: Mutex<f64>,
     timeline: Mutex<Timeline>,
     /// Exposures since the rig was made.
     exposures: AtomicU64,
@@ -98,6 +105,25 @@ pub(crate) enum Device {
 impl Shared {
     pub(crate) fn timeline(&self) -> MutexGuard<'_, Timeline> {
         self.timeline.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// The camera has been armed: the script begins.
+    pub(crate) fn arm(&self) {
+        self.timeline().arm(self.clock.now());
+        *self.automatic.lock().unwrap_or_else(PoisonError::into_inner) = 1.0;
+    }
+
+    /// What automatic exposure makes of the exposure time now.
+    pub(crate) fn automatic_factor(&self) -> f64 {
+        *self.automatic.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Lets automatic exposure answer to a picture whose mean is `mean_share` of full scale.
+    pub(crate) fn meter(&self, mean_share: f64) {
+        let Some(automatic) = self.script.auto_exposure() else { return };
+        let mut factor = self.automatic.lock().unwrap_or_else(PoisonError::into_inner);
+        let error = (automatic.target / mean_share.max(1e-3)).clamp(0.1, 10.0);
+        *factor = (*factor * error.powf(automatic.speed)).clamp(SHORTEST_AUTOMATIC, LONGEST_AUTOMATIC);
     }
 
     /// Number of a new exposure.
@@ -166,16 +192,21 @@ impl Rig {
         if !faults.is_empty() {
             return Err(RigError::Description(faults));
         }
-        let faults = scene.validate();
+        let script = Script::new(&description.faults);
+        let faults = [scene.validate(), script.check_scene(scene)].concat();
         if !faults.is_empty() {
             return Err(RigError::Scene(faults));
         }
         let panel = Panel::new(&description.projector);
         let world = World::new(description, scene, &panel)?;
+        let bumped =
+            script.bump().map(|(_, bump)| world.bumped(description, scene, &panel, &bump)).transpose()?;
         let shared = Shared {
             description: description.clone(),
             clock,
-            renderer: Renderer::new(description, world, panel),
+            renderer: Renderer::new(description, world, bumped, panel, &script),
+            script,
+            automatic: Mutex::new(1.0),
             timeline: Mutex::new(Timeline::new(description)),
             exposures: AtomicU64::new(0),
             region: Mutex::default(),

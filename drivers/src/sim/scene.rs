@@ -235,6 +235,7 @@ impl Scene {
                     object,
                     shape,
                     reflectance,
+                    shifted: Vector3::zeros(),
                 });
             }
         }

@@ -99,6 +99,23 @@ pub(crate) struct Primitive {
     pub(crate) shape: Shape,
     /// Factor on its material's reflectance.
     pub(crate) reflectance: f64,
+    /// How far it has been moved from where the scene puts it.
+    pub(crate) shifted: Vector3<f64>,
+}
+
+impl Primitive {
+    /// Moves it.
+    pub(crate) fn shift(&mut self, by: Vector3<f64>) {
+        self.shifted += by;
+        match &mut self.shape {
+            Shape::Plane { point, clip, .. } => {
+                *point += by;
+                clip.low += by;
+                clip.high += by;
+            }
+            Shape::Sphere { centre, .. } => *centre += by,
+        }
+    }
 }
 
 /// The first face that a ray meets: its number and the distance.

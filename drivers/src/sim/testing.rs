@@ -61,5 +61,6 @@ pub(crate) fn small_rig() -> RigDescription {
         analyser: Some(AnalyserDescription { azimuth_error_deg: 0.0, extinction: 500.0 }),
         ambient: AmbientDescription { electrons: 0.0 },
         flicker: None,
+        faults: Vec::new(),
     }
 }

@@ -8,6 +8,7 @@ use std::{
 use super::{
     description::{FlickerDescription, RigDescription},
     panel::Mixture,
+    script::{Script, since_ns},
 };
 use crate::{clock::Timestamp, projector::Slide};
 
@@ -31,6 +32,9 @@ pub(crate) struct Timeline {
     /// Time constant of the liquid crystals in s.
     lcd_s: f64,
     flicker: Option<FlickerDescription>,
+    script: Script,
+    /// When the camera was armed: from then on the script counts.
+    armed: Timestamp,
     /// Before the first of them the glass is black.
     changes: VecDeque<Change>,
     black: Arc<Slide>,
@@ -42,12 +46,15 @@ impl Timeline {
     pub(crate) fn new(description: &RigDescription) -> Self {
         let projector = &description.projector;
         let period_ns = (1e9 / projector.refresh_hz).round() as u64;
+        let script = Script::new(&description.faults);
+        let latency_refreshes = projector.latency_refreshes + script.extra_latency_refreshes();
         Self {
             period_ns,
-            latency_ns: u64::from(projector.latency_refreshes) * period_ns,
-            // From 10 % to 90 % an exponential takes ln 9 time constants.
-            lcd_s: 1e-3 * projector.lcd_10_90_ms / 9f64.ln(),
+            latency_ns: u64::from(latency_refreshes) * period_ns,
+            lcd_s: lcd_s(script.lcd_10_90_ms(projector.lcd_10_90_ms)),
             flicker: description.flicker.clone(),
+            script,
+            armed: Timestamp(0),
             changes: VecDeque::new(),
             black: Arc::new(Slide::Uniform([0; 3])),
             awaited: BTreeMap::new(),
@@ -59,14 +66,14 @@ impl Timeline {
         self.period_ns
     }
 
-    /// From flip to first light in ns.
-    pub(crate) fn latency_ns(&self) -> u64 {
-        self.latency_ns
+    /// The script counts from `now` on.
+    pub(crate) fn arm(&mut self, now: Timestamp) {
+        self.armed = now;
     }
 
-    /// From first light until less than `share` of the previous picture is left, in s.
-    pub(crate) fn settling_s(&self, share: f64) -> f64 {
-        self.lcd_s * (1.0 / share).ln()
+    /// Time after arming, negative before, in ns.
+    pub(crate) fn since_armed_ns(&self, time: Timestamp) -> f64 {
+        since_ns(time, self.armed)
     }
 
     /// Flips to `slide` (black for `None`) at the first refresh after `now`; its number and time.
@@ -93,7 +100,7 @@ impl Timeline {
     fn forget(&mut self, now_ns: u64) {
         let earliest = self.awaited.values().copied().min().unwrap_or(now_ns).min(now_ns);
         // Far beyond the negligible share even if many pictures add up.
-        let memory_ns = (1e9 * self.settling_s(1e-15)) as u64;
+        let memory_ns = (1e9 * self.lcd_s * 1e15f64.ln()) as u64;
         let horizon = earliest.saturating_sub(memory_ns);
         while self.changes.get(1).is_some_and(|next| next.at_ns <= horizon) {
             self.changes.pop_front();
@@ -102,7 +109,32 @@ impl Timeline {
 
     /// Light of an exposure: slides and their weights, in seconds of the mean lamp. Exact for the past of the clock.
     pub(crate) fn mixture(&self, start: Timestamp, end: Timestamp) -> Mixture {
-        let mut weights: Vec<(Arc<Slide>, f64)> = Vec::new();
+        let mut weights = Mixture::new();
+        let mut from = start;
+        for until in self.lamp_jumps(start, end).into_iter().chain([end]) {
+            // Between jumps the script's lamp changes slowly and evenly, so that its middle stands for all.
+            let middle = 0.5 * (self.since_armed_ns(from) + self.since_armed_ns(until));
+            let lamp = self.script.lamp(middle);
+            for (slide, weight) in self.steady_mixture(from, until) {
+                add(&mut weights, &slide, lamp * weight);
+            }
+            from = until;
+        }
+        without_negligible(weights)
+    }
+
+    /// Jumps of the lamp within an exposure, in order.
+    fn lamp_jumps(&self, start: Timestamp, end: Timestamp) -> Vec<Timestamp> {
+        let jumps =
+            self.script.lamp_jumps_ns().into_iter().map(|ns| Timestamp(self.armed.0.saturating_add(ns)));
+        let mut within: Vec<Timestamp> = jumps.filter(|jump| (start..end).contains(jump)).collect();
+        within.sort_unstable();
+        within
+    }
+
+    /// The same for a lamp that does nothing but flicker.
+    fn steady_mixture(&self, start: Timestamp, end: Timestamp) -> Mixture {
+        let mut weights = Mixture::new();
         // Shares of the pictures at the latest change, whatever came before it taken as settled.
         let mut shares: Vec<(Arc<Slide>, f64)> = vec![(self.black.clone(), 1.0)];
         let mut from_ns = 0;
@@ -132,7 +164,7 @@ impl Timeline {
             shares.push((change.slide.clone(), 0.0));
             from_ns = change.at_ns;
         }
-        without_negligible(weights)
+        weights
     }
 
     /// Share of an old picture left `ns` after a change.
@@ -163,6 +195,16 @@ impl Timeline {
         }
         (lamp, decaying)
     }
+}
+
+/// Time constant of liquid crystals: from 10 % to 90 % an exponential takes ln 9 of them.
+fn lcd_s(lcd_10_90_ms: f64) -> f64 {
+    1e-3 * lcd_10_90_ms / 9f64.ln()
+}
+
+/// From first light until less than `share` of the previous picture is left, in s.
+pub(crate) fn settling_s(lcd_10_90_ms: f64, share: f64) -> f64 {
+    lcd_s(lcd_10_90_ms) * (1.0 / share).ln()
 }
 
 /// Adds to the weight of an equal slide.

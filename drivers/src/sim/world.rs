@@ -1,7 +1,7 @@
 //! The scene as the camera sees it, computed once: per pixel the projector coordinate and how strongly each channel of
 //! the panel is seen there.
 
-use nalgebra::{Complex, Matrix3, Vector3};
+use nalgebra::{Complex, Matrix3, Rotation3, Vector3};
 use rayon::prelude::*;
 
 use super::{
@@ -12,6 +12,7 @@ use super::{
     polarization::{Analyser, Ray, across},
     rig::RigError,
     scene::{Material, Scene},
+    script::Bump,
     surface::{Primitive, is_shadowed, lobe, nearest, texture},
 };
 
@@ -68,11 +69,17 @@ pub(crate) struct World {
     pub(crate) sights: Vec<Sight>,
     /// Names of the faces, and whether they are planar.
     pub(crate) faces: Vec<(String, bool)>,
+    /// Factor of the light of each face that its level asks for.
+    factors: Vec<f32>,
 }
 
 /// Everything needed to look along a ray.
+#[derive(Clone)]
 struct Tracer<'a> {
     camera: Pinhole,
+    /// The camera's centre and axes in its own frame before a bump.
+    eye: Vector3<f64>,
+    turn: Rotation3<f64>,
     projector: Pinhole,
     placement: Placement,
     panel: &'a Panel,
@@ -122,6 +129,29 @@ impl World {
     /// Looks along the rays of all pixels and sets the levels of the scene's objects.
     pub(crate) fn new(description: &RigDescription, scene: &Scene, panel: &Panel) -> Result<Self, RigError> {
         let tracer = Tracer::new(description, scene, panel)?;
+        let mut world = Self::seen(description, &tracer)?;
+        world.factors = world.levels(description, scene, &tracer)?;
+        world.set_levels();
+        Ok(world)
+    }
+
+    /// The same lit as before, after a bump.
+    pub(crate) fn bumped(
+        &self,
+        description: &RigDescription,
+        scene: &Scene,
+        panel: &Panel,
+        bump: &Bump,
+    ) -> Result<Self, RigError> {
+        let mut tracer = Tracer::new(description, scene, panel)?;
+        tracer.bump(scene, bump);
+        let mut world = Self { factors: self.factors.clone(), ..Self::seen(description, &tracer)? };
+        world.set_levels();
+        Ok(world)
+    }
+
+    /// What the rays of all pixels meet, in the light that materials return by themselves.
+    fn seen(description: &RigDescription, tracer: &Tracer<'_>) -> Result<Self, RigError> {
         let border = if description.camera.blur_px > 0.0 { reach_px(description.camera.blur_px) } else { 0 };
         let [width, height] = description.camera.size.map(|side| side as usize + 2 * border);
         let mut views = vec![View::DARK; width * height];
@@ -137,18 +167,16 @@ impl World {
         })?;
         let faces =
             tracer.primitives.iter().map(|face| (face.name.clone(), face.shape.is_planar())).collect();
-        let mut world = Self { width, height, border, views, sights, faces };
-        world.set_levels(description, scene, &tracer)?;
-        Ok(world)
+        Ok(Self { width, height, border, views, sights, faces, factors: Vec::new() })
     }
 
-    /// Scales the light of each object to its level: see [`super::scene::Object::level`].
-    fn set_levels(
-        &mut self,
+    /// Factor of the light of each face for its object's level: see [`super::scene::Object::level`].
+    fn levels(
+        &self,
         description: &RigDescription,
         scene: &Scene,
         tracer: &Tracer<'_>,
-    ) -> Result<(), RigError> {
+    ) -> Result<Vec<f32>, RigError> {
         let brightest = self.brightest(description, tracer, scene.objects.len());
         let full_well = description.camera.full_well_e;
         let mut factors: Vec<Option<f64>> = vec![None; scene.objects.len()];
@@ -172,18 +200,23 @@ impl World {
             }
         }
         let light = light.unwrap_or(1.0);
-        let per_face: Vec<f32> =
-            tracer.primitives.iter().map(|face| (factors[face.object].unwrap_or(light)) as f32).collect();
+        Ok(tracer.primitives.iter().map(|face| (factors[face.object].unwrap_or(light)) as f32).collect())
+    }
+
+    fn set_levels(&mut self) {
+        let per_face = &self.factors;
         self.views.par_iter_mut().zip(&self.sights).for_each(|(view, sight)| {
             if let Some(factor) = per_face.get(usize::from(sight.face)) {
                 view.gain.iter_mut().for_each(|gain| *gain *= factor);
             }
         });
-        Ok(())
     }
 
-    /// Most light of any lit pixel of each object under uniform H, within the sensor.
+    /// Most light of any lit pixel of each object under uniform H, within the sensor, through an analyser that stands
+    /// right: a level is a property of the scene's light, which a turned analyser must not make up for.
     fn brightest(&self, description: &RigDescription, tracer: &Tracer<'_>, objects: usize) -> Vec<f64> {
+        let turned = description.analyser.as_ref().is_some_and(|analyser| analyser.azimuth_error_deg != 0.0);
+        let aligned = turned.then(|| tracer.aligned(description));
         let polarization = description.projector.polarization;
         let carries_h = polarization.contains(&PanelPolarization::Horizontal);
         let drive: [f64; 3] = std::array::from_fn(|channel| {
@@ -195,11 +228,15 @@ impl World {
             .map(|y| {
                 let mut brightest = vec![0.0f64; objects];
                 let row = y * self.width + self.border..(y + 1) * self.width - self.border;
-                for (view, sight) in self.views[row.clone()].iter().zip(&self.sights[row]) {
+                for (x, (view, sight)) in self.views[row.clone()].iter().zip(&self.sights[row]).enumerate() {
                     if sight.is_lit() {
                         let object = tracer.primitives[usize::from(sight.face)].object;
+                        let pixel = [x as f64, (y - self.border) as f64];
+                        let again =
+                            aligned.as_ref().and_then(|tracer| Some(tracer.look(tracer.camera.ray(pixel)?)));
+                        let gain = again.map_or(view.gain, |(view, _)| view.gain);
                         let seen: f64 =
-                            drive.iter().zip(view.gain).map(|(drive, gain)| drive * f64::from(gain)).sum();
+                            drive.iter().zip(gain).map(|(drive, gain)| drive * f64::from(gain)).sum();
                         brightest[object] = brightest[object].max(seen);
                     }
                 }
@@ -228,6 +265,8 @@ impl<'a> Tracer<'a> {
         let materials = scene.objects.iter().map(|object| &scene.materials[&object.material]).collect();
         Ok(Self {
             camera: camera_lens(description),
+            eye: Vector3::zeros(),
+            turn: Rotation3::identity(),
             projector: projector_lens(description),
             projector_horizontal: placement.rotation.transpose() * Vector3::x(),
             placement,
@@ -241,12 +280,37 @@ impl<'a> Tracer<'a> {
         })
     }
 
+    /// The same with the analyser's axis level.
+    fn aligned(&self, description: &RigDescription) -> Self {
+        let analyser = description.analyser.as_ref();
+        let analyser = analyser.map_or(Analyser::NONE, |analyser| Analyser::linear(0.0, analyser.extinction));
+        Self { analyser, ..self.clone() }
+    }
+
+    /// Moves what was bumped.
+    fn bump(&mut self, scene: &Scene, bump: &Bump) {
+        match bump {
+            Bump::Camera { by_mm, turn_deg: [x, y, z] } => {
+                self.eye = Vector3::from(*by_mm);
+                self.turn = Rotation3::from_euler_angles(x.to_radians(), y.to_radians(), z.to_radians());
+            }
+            Bump::Object { name, by_mm } => {
+                for face in &mut self.primitives {
+                    if scene.objects[face.object].name == *name {
+                        face.shift(Vector3::from(*by_mm));
+                    }
+                }
+            }
+        }
+    }
+
     /// What is seen along a ray of the camera.
     fn look(&self, ray: Vector3<f64>) -> (View, Sight) {
-        let Some((face, distance)) = nearest(&self.primitives, Vector3::zeros(), ray) else {
+        let ray = self.turn * ray;
+        let Some((face, distance)) = nearest(&self.primitives, self.eye, ray) else {
             return (View::DARK, Sight::NOTHING);
         };
-        let point = ray * distance;
+        let point = self.eye + ray * distance;
         let dark = (View::DARK, Sight { depth_mm: point.z as f32, face: face as u8, ..Sight::NOTHING });
         let primitive = &self.primitives[face];
         let normal = primitive.shape.normal_against(point, ray);
@@ -284,7 +348,8 @@ impl<'a> Tracer<'a> {
         if material.texture == 0.0 {
             return 0.0;
         }
-        texture(noise::mix(self.seed ^ noise::mix(primitive.object as u64)), point, material.texture_mm)
+        let on_object = point - primitive.shifted;
+        texture(noise::mix(self.seed ^ noise::mix(primitive.object as u64)), on_object, material.texture_mm)
     }
 
     /// Light behind the analyser, per irradiance across the light, of a source with Stokes vector (1, 0, 0, 0), and what
@@ -305,7 +370,7 @@ impl<'a> Tracer<'a> {
                 let along = -to_light;
                 let ray = Ray { along, first: across(self.projector_horizontal, along), stokes };
                 let reflected = ray.reflect(facet, to_camera, Complex::new(n, k));
-                *seen += strength * reflected.through(self.analyser, Vector3::x());
+                *seen += strength * reflected.through(self.analyser, self.turn * Vector3::x());
             }
         }
         seen

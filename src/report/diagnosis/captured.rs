@@ -6,7 +6,7 @@ use super::{Diagnosis, Reason};
 use crate::sequencer::{CaptureError, Finding};
 
 /// The diagnosis behind a finding of the sequencer, whose names are finer: they tell how a fault was noticed.
-fn diagnosis(reason: &str) -> Diagnosis {
+pub(super) fn diagnosis(reason: &str) -> Diagnosis {
     match reason {
         "damaged-frame" | "late-frame" => Diagnosis::LostFrame,
         "duplicate-frame" | "stale-receipt" | "wrong-slide" => Diagnosis::StaleFrame,
@@ -34,6 +34,9 @@ fn advice(diagnosis: Diagnosis) -> &'static str {
         Diagnosis::AmbientDrift => "keep other light in the room constant",
         Diagnosis::DeviceFault => "check the device and scan again",
         Diagnosis::NonlinearResponse => "switch off sharpening and picture modes of the projector",
+        Diagnosis::NoiseModel => {
+            "measure it with `polscan calibrate noise`, and check the camera's gamma and gain"
+        }
         Diagnosis::Cancelled => "scan again when ready",
         _ => "read the evidence before trusting the result",
     }

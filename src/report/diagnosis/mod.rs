@@ -4,9 +4,11 @@
 //! reason at all; what is merely worth knowing is a note of the report.
 
 mod captured;
-mod look;
+mod dark;
 mod order;
 mod pairs;
+mod polarity;
+mod references;
 mod rules;
 mod sensor;
 
@@ -15,7 +17,7 @@ use std::fmt;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-pub(super) use rules::{diagnose, notes};
+pub(super) use rules::{degree_of_polarization, diagnose, notes};
 
 /// What can be wrong with a scan. `docs/diagnoses.md` has a row for each.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
@@ -59,6 +61,8 @@ pub enum Diagnosis {
     DeviceFault,
     /// Part of the proof that frames and pictures belong together is missing.
     CaptureUnproven,
+    /// Frames are noisier than the camera's noise model says.
+    NoiseModel,
     /// The capture was cancelled.
     Cancelled,
     /// The frames are there and cannot be decoded.
@@ -67,7 +71,7 @@ pub enum Diagnosis {
 
 impl Diagnosis {
     /// All of them, in the order of the documentation.
-    pub const ALL: [Self; 21] = [
+    pub const ALL: [Self; 22] = [
         Self::StaleFrame,
         Self::LostFrame,
         Self::TornFrame,
@@ -87,6 +91,7 @@ impl Diagnosis {
         Self::LowCoverage,
         Self::DeviceFault,
         Self::CaptureUnproven,
+        Self::NoiseModel,
         Self::Cancelled,
         Self::DecodeFailed,
     ];
@@ -113,6 +118,7 @@ impl Diagnosis {
             Self::LowCoverage => "low-coverage",
             Self::DeviceFault => "device-fault",
             Self::CaptureUnproven => "capture-unproven",
+            Self::NoiseModel => "noise-model",
             Self::Cancelled => "cancelled",
             Self::DecodeFailed => "decode-failed",
         }

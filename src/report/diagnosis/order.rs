@@ -9,6 +9,7 @@ use polscan_patterns::{Axis, AxisCode};
 use crate::{
     decode::{DecodeSettings, Decoded},
     grid::Grid,
+    report::PixelCounts,
 };
 
 /// Distance in camera px over which slopes are taken: short of the blocks of all but the finest bits.
@@ -66,6 +67,46 @@ fn explain(
         (count.score(), (axis, bit))
     });
     scored.max_by(|a, b| a.0.cmp(&b.0)).map(|(_, pair)| pair)
+}
+
+/// The pair of the columns whose exchange makes the words of a scan without rows whole: where it removes jumps, or, of
+/// the most significant pair, where words run backwards and most points lie out of the volume for it.
+pub fn reversed(
+    decoded: &Decoded,
+    settings: Option<&DecodeSettings>,
+    pixels: &PixelCounts,
+) -> Option<(Axis, u8)> {
+    if decoded.row.is_some() {
+        return None;
+    }
+    let code = settings?.column;
+    let columns = &decoded.column.code;
+    let places = places(columns);
+    let runs = |bit: Option<u8>| {
+        let word = |index: usize| match bit {
+            Some(bit) => exchange(at(columns, index)?, bit, code),
+            None => at(columns, index),
+        };
+        let (mut seen, mut rising, mut jumps) = (0u64, 0u64, 0u64);
+        for &[here, right, _, next] in &places {
+            let (Some(here), Some(right), Some(next)) = (word(here), word(right), word(next)) else {
+                continue;
+            };
+            seen += 1;
+            rising += u64::from(right > here);
+            jumps += u64::from((next - here).abs() > 2);
+        }
+        (seen >= LEAST_PLACES).then(|| [rising, jumps].map(|count| count as f64 / seen as f64))
+    };
+    let [rising, jumps] = runs(None)?;
+    if rising > 1.0 - MIRRORED_SHARE {
+        return None;
+    }
+    let candidates = (0..code.bits()).filter_map(|bit| Some((bit, runs(Some(bit))?)));
+    let (bit, [turned, left]) = candidates.max_by(|a, b| (a.1[0] - a.1[1]).total_cmp(&(b.1[0] - b.1[1])))?;
+    let out = pixels.out_of_volume as f64 > 0.5 * (pixels.out_of_volume + pixels.valid) as f64;
+    let is_better = turned > MIRRORED_SHARE && left <= jumps && (out || (bit > 0 && left < 0.5 * jumps));
+    is_better.then_some((Axis::Column, bit))
 }
 
 /// The index whose word differs from that of `index` in `bit`.

@@ -10,26 +10,18 @@ mod light;
 use polscan_patterns::Axis;
 use serde_json::{Value, json};
 
-use super::{
-    Diagnosis, Reason,
-    look::{Frames, Look},
-};
+use super::{Diagnosis, Reason};
 use crate::{
     decode::{Decoded, PairResidual},
+    evidence::{Cause, EDGE_OUTLIERS, FLAT_OUTLIERS, Frames, Look},
     report::statistics,
 };
 
-/// Share of flat pixels beyond 5 sigma that disturbs a pair. Real captures that are sound stay below 0.0002, and noise
-/// alone below 0.000001; 0.002 of 1 MP is an area of 45 x 45 px.
-const FLAT_OUTLIERS: f64 = 0.002;
 /// Fewer outliers than this are no evidence of anything.
 const LEAST_OUTLIERS: f64 = 20.0;
 /// Common shift of a pair against the other pairs, in sigma of a pixel. Rounding to 8 bits shifts real captures by up to
 /// 0.9, all pairs alike within 0.6.
 const SHIFT_SIGMA: f64 = 1.0;
-/// Share of the pixels at stripe edges beyond 5 sigma that shows a response that is not linear. A linear projector and
-/// camera stay below 0.0002; those with a gamma lie at 0.04 and above.
-const EDGE_OUTLIERS: f64 = 0.01;
 /// Shift or spread of the two finest pairs that shows crosstalk between neighbouring pixels of the panel.
 const FINE_SIGMA: f64 = 3.0;
 /// Bits with stripes of up to this power of two of projector pixels have no flat areas on all rigs.
@@ -42,8 +34,6 @@ const SOUND_OUTLIERS: f64 = 0.05;
 /// from 8-bit frames in particular, sound pairs reach them.
 const LOOK_SHIFT: f64 = 0.5;
 const LOOK_SIGMA: f64 = 1.25;
-/// Change of the light of single frames that is a reason, by the same measure as `DRIFT`.
-const CHANGE: f64 = 0.02;
 
 /// A pair with what the rules ask of it.
 #[derive(Clone, Copy)]
@@ -97,7 +87,7 @@ struct Case<'a> {
 
 impl Case<'_> {
     fn share(&self) -> f64 {
-        self.look.as_ref().map_or(self.view.outliers(), |look| look.unexplained)
+        self.look.as_ref().map_or(self.view.outliers(), Look::disturbed)
     }
 
     fn strength(&self) -> Option<f64> {
@@ -111,6 +101,7 @@ impl Case<'_> {
                 "outliers": look.outliers, "brightness_change": look.change,
                 "unexplained_by_brightness": look.unexplained, "spread_unexplained": look.spread,
                 "residual_share_of_modulation": look.strength, "torn_at_row": look.torn_at,
+                "noise_of_assumed": look.noise,
             });
         }
         evidence
@@ -134,8 +125,11 @@ fn sort<'a>(coarse: &[View<'a>], frames: Option<Frames>, measured_noise: bool) -
         let close = |frames: Frames| frames.look(view.pair.axis, view.pair.bit, true);
         let look = conspicuous.then(|| frames.and_then(close)).flatten();
         let (brightness, disturbed) = match &look {
-            Some(look) if look.is_brightness() => (look.change.abs() > CHANGE, false),
-            Some(look) => (false, look.unexplained > FLAT_OUTLIERS),
+            Some(look) => match look.cause() {
+                Cause::Nothing => (false, false),
+                Cause::Lamp | Cause::Room => (true, false),
+                _ => (false, true),
+            },
             None => (view.is_shifted(), view.is_disturbed()),
         };
         match (brightness, disturbed) {
@@ -150,16 +144,38 @@ fn sort<'a>(coarse: &[View<'a>], frames: Option<Frames>, measured_noise: bool) -
 /// All reasons that the pair sums give. `frames` allow a closer look at pairs that fail.
 pub fn diagnose(decoded: &Decoded, frames: Option<Frames>) -> Vec<Reason> {
     let views = views(&decoded.pairs);
-    let (fine, mut coarse): (Vec<View>, Vec<View>) = views.iter().partition(|view| view.rank < FINE_RANKS);
+    let (mut fine, mut coarse): (Vec<View>, Vec<View>) =
+        views.iter().partition(|view| view.rank < FINE_RANKS);
+    // Compared with the mean of all pairs, every pair shows what is wrong with one of them; the median does not.
+    if let Some(frames) = frames.filter(|frames| !frames.has_references())
+        && fine.iter().any(|view| view.outliers() > SOUND_OUTLIERS)
+    {
+        for view in &mut fine {
+            if let Some(look) = frames.look(view.pair.axis, view.pair.bit, false) {
+                (view.flat, view.edge) = (look.disturbed(), look.disturbed());
+            }
+        }
+    }
     if coarse.is_empty() {
         coarse.clone_from(&views);
     }
-    let Sorted { sound, shifted, disturbed } = sort(&coarse, frames, !decoded.noise_estimated);
+    let Sorted { sound, mut shifted, disturbed } = sort(&coarse, frames, !decoded.noise_estimated);
+
+    let mut lone_fine = lone(&fine).map(|view| {
+        let look = frames.and_then(|frames| frames.look(view.pair.axis, view.pair.bit, false));
+        Case { view, look }
+    });
+    let light = |case: &Case| {
+        case.look.as_ref().is_some_and(|look| matches!(look.cause(), Cause::Lamp | Cause::Room))
+    };
+    if lone_fine.as_ref().is_some_and(light) {
+        shifted.extend(lone_fine.take());
+    }
 
     let mut reasons = Vec::new();
     reasons.extend(light::brightness(decoded, frames, &coarse, &shifted));
     if !disturbed.is_empty() {
-        reasons.push(disturbed::disturbance(&disturbed, coarse.len()));
+        reasons.push(disturbed::disturbance(&disturbed, coarse.len(), frames));
         // With pairs disturbed, what happens at edges and in fine stripes is no evidence of its own; nor where pairs are
         // compared with each other for want of references.
         let compared = frames.is_some_and(|frames| !frames.has_references());
@@ -167,11 +183,8 @@ pub fn diagnose(decoded: &Decoded, frames: Option<Frames>) -> Vec<Reason> {
             return reasons;
         }
     }
-    match lone(&fine) {
-        Some(view) if disturbed.is_empty() => {
-            let look = frames.and_then(|frames| frames.look(view.pair.axis, view.pair.bit, false));
-            reasons.push(disturbed::fine_frame(&Case { view, look }));
-        }
+    match lone_fine {
+        Some(case) if disturbed.is_empty() => reasons.push(disturbed::fine_frame(&case)),
         Some(_) => {}
         None => {
             // Light that changes shifts fine pairs as it does coarse ones.
@@ -235,7 +248,8 @@ fn lone<'a>(fine: &[View<'a>]) -> Option<View<'a>> {
 
 /// A response that is not linear shows at stripe edges, or in the finest stripes, which have nothing else.
 fn nonlinear(sound: &[View], fine: &[View]) -> Option<Reason> {
-    let mut edges: Vec<f64> = sound.iter().map(|view| view.edge).collect();
+    // Where as many flat pixels are off, too, it is not the edges.
+    let mut edges: Vec<f64> = sound.iter().map(|view| (view.edge - 2.0 * view.flat).max(0.0)).collect();
     let edges = statistics::median(&mut edges).unwrap_or(0.0);
     let finest: Vec<View> = fine.iter().filter(|view| view.rank <= 1).copied().collect();
     let worst_fine = worst(&finest, |view| view.shift.abs().max(view.sigma()))

@@ -1,11 +1,12 @@
 //! All reasons and notes of a report.
 
-use serde_json::json;
+use serde_json::{Value, json};
 
-use super::{Diagnosis, Reason, Verdict, look::Frames, order, pairs, sensor};
+use super::{Diagnosis, Reason, Verdict, captured, dark, order, pairs, polarity, references, sensor};
 use crate::{
     cloud::RowCheck,
     decode::{Class, Decoded},
+    evidence::Frames,
     report::{
         CaptureSummary, PixelCounts, ReportInput,
         statistics::{self, share},
@@ -30,6 +31,8 @@ const INVERTED_NOTE: f64 = 0.01;
 /// Degree of polarization, weighed by brightness, that an analyser turned by 30 degrees or an extinction of 3:1 leaves:
 /// then a half of the light carries no code.
 const WEAK: f64 = 0.5;
+/// The same as a share of that of the rig's extinction ratio, where it is known: an analyser turned by 12 degrees.
+const TURNED: f64 = 0.91;
 /// Share of the lit pixels with edges in illegal places: noise makes few, an order that is wrong makes most.
 const OFF_BOUNDARY: f64 = 0.2;
 /// Share of the measured pixels that the row gate may reject, and above which the calibration cannot be right.
@@ -47,52 +50,124 @@ pub fn diagnose(input: &ReportInput, pixels: Option<&PixelCounts>) -> Vec<Reason
             None => reasons.extend(from_pixels(input, decoded, pixels)),
         }
     }
+    // What the capture noticed of the light in single pairs, the whole scan names with more right.
+    let whole = reasons.iter().any(|reason| OF_THE_LIGHT.contains(&reason.diagnosis));
+    let superseded = |reason: &Reason| {
+        whole && reason.severity != Verdict::Failed && OF_THE_LIGHT.contains(&reason.diagnosis)
+    };
     // Last, so that of equals the one with the numbers of the whole scan is kept.
-    reasons.extend_from_slice(input.found);
-    once_each(reasons)
+    reasons.extend(input.found.iter().filter(|reason| !superseded(reason)).cloned());
+    let mut reasons = once_each(reasons);
+    // The gravest first: it is what a person reads.
+    reasons.sort_by_key(|reason| std::cmp::Reverse(reason.severity));
+    reasons
 }
+
+/// Diagnoses that the pair sums of all frames tell apart better than those of one pair.
+const OF_THE_LIGHT: [Diagnosis; 7] = [
+    Diagnosis::Flicker,
+    Diagnosis::ExposureDrift,
+    Diagnosis::AmbientDrift,
+    Diagnosis::UnsettledDisplay,
+    Diagnosis::NonlinearResponse,
+    Diagnosis::NoiseModel,
+    Diagnosis::Saturated,
+];
 
 fn from_pixels(input: &ReportInput, decoded: &Decoded, pixels: &PixelCounts) -> Vec<Reason> {
     let look = input.settings.filter(|_| !input.planes.is_empty());
-    let look = look.map(|settings| Frames { all: input.planes, settings, decoded });
-    let mut reasons = pairs::diagnose(decoded, look);
-    let names = [Diagnosis::StaleFrame, Diagnosis::TornFrame, Diagnosis::SwappedFrames];
+    let mut look =
+        look.map(|settings| Frames { all: input.planes, settings, decoded, last_references: true });
+    let mut reasons: Vec<Reason> = look.and_then(references::disagree).into_iter().collect();
+    if let (Some(frames), false) = (&mut look, reasons.is_empty()) {
+        frames.last_references = false;
+    }
+    reasons.extend(pairs::diagnose(decoded, look));
+    if !reasons.is_empty() && look.is_some_and(|frames| !frames.last_references) {
+        // A drift between references that show different pictures is none.
+        reasons
+            .retain(|reason| !matches!(reason.diagnosis, Diagnosis::ExposureDrift | Diagnosis::AmbientDrift));
+    }
+    let names = [
+        Diagnosis::StaleFrame,
+        Diagnosis::LostFrame,
+        Diagnosis::TornFrame,
+        Diagnosis::SwappedFrames,
+        Diagnosis::PolarizationInverted,
+    ];
     let is_wrong = |reason: &Reason| reason.severity == Verdict::Failed && names.contains(&reason.diagnosis);
+    reasons.extend(look.and_then(polarity::reference_exchanged));
     // A wrong frame puts edges in wrong places, too: that would be said twice.
     let wrong = reasons.iter().any(is_wrong);
-    reasons.extend(wrong_order(input, decoded, pixels, !wrong));
+    if !wrong || !reasons.iter().any(|reason| reason.diagnosis == Diagnosis::PolarizationInverted) {
+        reasons.extend(wrong_order(input, decoded, pixels, !wrong));
+    }
     reasons.extend(polarization(input, decoded, pixels));
     reasons.extend(saturated(decoded, pixels));
     reasons.extend(input.reconstruction.and_then(|made| made.row_check).and_then(row_mismatch));
-    reasons.extend(sensor::defect(decoded, pixels));
-    reasons.extend(low_coverage(pixels));
+    // Beside saturated pixels others fail, too, without being dead.
+    let glares = reasons.iter().any(|reason| reason.diagnosis == Diagnosis::Saturated);
+    let defect = sensor::defect(decoded, pixels);
+    reasons.extend(defect.filter(|reason| !glares || has_lines(reason)));
+    reasons.extend(low_coverage(pixels).or_else(|| dark::too_dark(look?, pixels)));
     if reasons.iter().any(is_wrong) {
         // What comes of words that are wrong says nothing of light, sensor or surface.
         let follows = [
             Diagnosis::Flicker,
             Diagnosis::UnsettledDisplay,
-            Diagnosis::PolarizationInverted,
             Diagnosis::PolarizationWeak,
             Diagnosis::SensorDefect,
             Diagnosis::LowCoverage,
+            Diagnosis::RowMismatch,
         ];
-        reasons.retain(|reason| !follows.contains(&reason.diagnosis));
+        reasons.retain(|reason| {
+            let inverted = reason.diagnosis == Diagnosis::PolarizationInverted;
+            !follows.contains(&reason.diagnosis) && !(inverted && reason.severity != Verdict::Failed)
+        });
     }
     reasons
 }
 
-/// Of several reasons with the same diagnosis keeps the gravest, of equals the first.
+/// Whether a defect of the sensor is one of whole lines.
+fn has_lines(reason: &Reason) -> bool {
+    ["columns", "rows"]
+        .iter()
+        .any(|key| reason.evidence[key].as_array().is_some_and(|lines| !lines.is_empty()))
+}
+
+/// Of several reasons with the same diagnosis keeps the gravest, of equals the first, with what the others say beside
+/// it under `also`.
 fn once_each(reasons: Vec<Reason>) -> Vec<Reason> {
     let mut kept: Vec<Reason> = Vec::new();
-    for reason in reasons {
-        match kept.iter_mut().find(|other| other.diagnosis == reason.diagnosis) {
-            Some(other) if reason.severity > other.severity => *other = reason,
-            Some(_) => {}
-            None => kept.push(reason),
+    for mut reason in reasons {
+        let Some(other) = kept.iter_mut().find(|other| other.diagnosis == reason.diagnosis) else {
+            kept.push(reason);
+            continue;
+        };
+        if reason.severity > other.severity {
+            std::mem::swap(other, &mut reason);
+        }
+        let mut also = match reason.evidence.as_object_mut().and_then(|evidence| evidence.remove("also")) {
+            Some(Value::Array(also)) => also,
+            _ => Vec::new(),
+        };
+        also.insert(0, json!({ "message": reason.message, "evidence": reason.evidence }));
+        if !other.evidence.is_object() {
+            other.evidence = json!({});
+        }
+        match other.evidence.get_mut("also").and_then(Value::as_array_mut) {
+            Some(list) => list.extend(also),
+            None => other.evidence["also"] = Value::Array(also),
+        }
+        if let Some(list) = other.evidence["also"].as_array_mut() {
+            list.truncate(MOST_ALSO);
         }
     }
     kept
 }
+
+/// So many reasons of one kind are written out besides the first.
+const MOST_ALSO: usize = 8;
 
 /// What receipts and counters of the capture say against it.
 fn frames(capture: &CaptureSummary) -> Vec<Reason> {
@@ -118,11 +193,14 @@ fn frames(capture: &CaptureSummary) -> Vec<Reason> {
             json!({ "frames": capture.shared_slide.iter().map(|[a, b]| [a.to_string(), b.to_string()]).collect::<Vec<_>>() }),
         ));
     }
-    // A lost frame that was noticed and taken again has cost time, nothing else.
-    let retaken =
-        capture.retaken.iter().filter(|retake| retake.reason == Diagnosis::LostFrame.slug()).count();
+    // A lost frame that was noticed and taken again has cost time, nothing else: each asks for one take.
+    let pairs = capture.retaken.iter().map(|retake| &retake.reason);
+    let references = capture.references_retaken.iter().map(|retake| &retake.reason);
+    let noticed =
+        pairs.chain(references).filter(|reason| captured::diagnosis(reason) == Diagnosis::LostFrame);
+    let retaken = noticed.count() as u64;
     let lost = capture.lost_frames();
-    if lost > 2 * retaken as u64 {
+    if lost > retaken {
         reasons.push(Reason::degraded(
             Diagnosis::LostFrame,
             format!(
@@ -131,7 +209,7 @@ fn frames(capture: &CaptureSummary) -> Vec<Reason> {
                 capture.statistics.triggers,
                 plural(capture.statistics.frames, "whole frame"),
             ),
-            json!({ "lost": lost, "triggers": capture.statistics.triggers, "frames": capture.statistics.frames,
+            json!({ "lost": lost, "retaken": retaken, "triggers": capture.statistics.triggers, "frames": capture.statistics.frames,
                     "failed": capture.statistics.failed }),
         ));
     }
@@ -187,6 +265,17 @@ fn wrong_order(
         });
         return Some(Reason::failed(Diagnosis::SwappedFrames, message, evidence));
     }
+    if let Some((axis, bit)) = order::reversed(decoded, input.settings, pixels) {
+        return Some(Reason::failed(
+            Diagnosis::SwappedFrames,
+            format!(
+                "the words of the image run backwards or jump, and would not if the two frames of pair {axis} bit {bit} were \
+                 exchanged; they are, or the projector is set to rear projection: check the order of the frames and the \
+                 projector's menu, and scan again"
+            ),
+            json!({ "axis": axis, "bit": bit, "out_of_volume": pixels.out_of_volume, "valid": pixels.valid }),
+        ));
+    }
     if !by_edges {
         return None;
     }
@@ -231,7 +320,8 @@ fn polarization(input: &ReportInput, decoded: &Decoded, pixels: &PixelCounts) ->
                 Diagnosis::PolarizationInverted,
                 format!(
                     "on {percent:.0} % of the lit pixels V is brighter than H; H and V are exchanged: turn the polarizer \
-                     in front of the camera by 90 degrees, or exchange the projector's channels in the configuration"
+                     in front of the camera by 90 degrees, or exchange the projector's channels in the configuration; \
+                     or all that is seen scatters light and absorbs the colour of H, as red paint does"
                 ),
                 evidence,
             ),
@@ -246,8 +336,10 @@ fn polarization(input: &ReportInput, decoded: &Decoded, pixels: &PixelCounts) ->
         });
     }
     if input.mode.is_polarized()
-        && let Some(degree) = degree_of_polarization(decoded).filter(|&degree| degree < WEAK)
+        && let Some(degree) = degree_of_polarization(decoded)
+        && degree < input.extinction_ratio.map_or(WEAK, |ratio| TURNED * degree_of(ratio))
     {
+        let usual = input.extinction_ratio.map_or(1.0, degree_of);
         reasons.push(Reason::degraded(
             Diagnosis::PolarizationWeak,
             format!(
@@ -256,16 +348,21 @@ fn polarization(input: &ReportInput, decoded: &Decoded, pixels: &PixelCounts) ->
                  the polarizer until `polscan show v` is darkest, and shade the scene",
                 100.0 * degree,
                 // H and V pass as cos^2 and sin^2 of the angle, so their contrast is the cosine of twice the angle.
-                0.5 * degree.clamp(0.0, 1.0).acos().to_degrees(),
+                0.5 * (degree / usual).clamp(0.0, 1.0).acos().to_degrees(),
             ),
-            json!({ "degree_of_polarization": degree }),
+            json!({ "degree_of_polarization": degree, "extinction_ratio": input.extinction_ratio }),
         ));
     }
     reasons
 }
 
+/// Degree of polarization of light whose two parts have this ratio.
+fn degree_of(extinction_ratio: f64) -> f64 {
+    (extinction_ratio - 1.0) / (extinction_ratio + 1.0)
+}
+
 /// Mean over the lit, unsaturated pixels of the usual polarity, weighed by brightness: dark pixels say little.
-fn degree_of_polarization(decoded: &Decoded) -> Option<f64> {
+pub fn degree_of_polarization(decoded: &Decoded) -> Option<f64> {
     let (mut sum, mut weight) = (0.0, 0.0);
     for (index, class) in decoded.class.data().iter().enumerate() {
         let degree = f64::from(decoded.dolp.data()[index]);
@@ -402,8 +499,25 @@ pub fn notes(input: &ReportInput, pixels: Option<&PixelCounts>) -> Vec<String> {
             );
         }
         if !capture.retaken.is_empty() {
-            notes
-                .push(format!("{} captured again, then sound", plural(capture.retaken.len() as u64, "pair")));
+            notes.push(format!(
+                "{} captured again, then sound ({})",
+                plural(capture.retaken.len() as u64, "pair"),
+                why(capture.retaken.iter().map(|retake| retake.reason.as_str())),
+            ));
+        }
+        if !capture.references_retaken.is_empty() {
+            notes.push(format!(
+                "{} captured again ({})",
+                plural(capture.references_retaken.len() as u64, "reference"),
+                why(capture.references_retaken.iter().map(|retake| retake.reason.as_str())),
+            ));
+        }
+        if !capture.discarded.is_empty() {
+            notes.push(format!(
+                "{} arrived that was not awaited, and was dropped ({})",
+                plural(capture.discarded.len() as u64, "frame"),
+                why(capture.discarded.iter().map(|found| found.reason.as_str())),
+            ));
         }
     }
     let inverted = share(pixels.inverted, pixels.lit).unwrap_or(0.0);
@@ -415,6 +529,17 @@ pub fn notes(input: &ReportInput, pixels: Option<&PixelCounts>) -> Vec<String> {
         ));
     }
     notes
+}
+
+/// Each reason once, with how often it came.
+fn why<'a>(reasons: impl Iterator<Item = &'a str>) -> String {
+    let mut counts = std::collections::BTreeMap::<&str, u32>::new();
+    reasons.for_each(|reason| *counts.entry(reason).or_default() += 1);
+    let named: Vec<String> = counts
+        .into_iter()
+        .map(|(reason, count)| if count == 1 { reason.to_owned() } else { format!("{count} x {reason}") })
+        .collect();
+    named.join(", ")
 }
 
 /// `1 frame`, `3 frames`.
@@ -682,7 +807,13 @@ mod tests {
         let found = [reason(DEGRADED), reason(FAILED), reason(DEGRADED)];
         let input =
             ReportInput { found: &found, ..ReportInput::new(Mode::Pse, Size { width: 1, height: 1 }, 0) };
-        assert_eq!(diagnose(&input, None), [reason(FAILED)]);
+        let [kept] = &diagnose(&input, None)[..] else { panic!("one reason") };
+        assert_eq!(
+            (kept.diagnosis, kept.severity, kept.message.as_str()),
+            (Diagnosis::Motion, FAILED, "moved")
+        );
+        // What the others say is kept beside it.
+        assert_eq!(kept.evidence["also"].as_array().map(Vec::len), Some(2));
     }
 
     #[test]

@@ -11,6 +11,8 @@ use crate::{
 /// Dead pixels among the valid ones: sensors as sold have fewer.
 const DEAD: f64 = 1e-4;
 const LEAST_DEAD: u64 = 10;
+/// Modulation of the neighbours, in sigma, beside which a pixel without any is dead.
+const STRONG_SIGMA: f64 = 12.0;
 /// A line of the sensor counts where it crosses this many pixels with valid neighbours, and is dead where it fails on
 /// most of them.
 const LINE_PIXELS: u32 = 50;
@@ -21,6 +23,12 @@ pub fn defect(decoded: &Decoded, pixels: &PixelCounts) -> Option<Reason> {
     let class = &decoded.class;
     let (width, height) = (class.width(), class.height());
     let valid = |x: usize, y: usize| class.at(x, y).is_valid();
+    // Where the light is weak, noise alone puts out single pixels.
+    let strong = |x: usize, y: usize| {
+        let modulation = f64::from(decoded.modulation.at(x, y)).abs();
+        let sigma = (decoded.noise.variance(modulation) + decoded.noise.variance(0.0)).sqrt();
+        modulation > STRONG_SIGMA * sigma
+    };
     let mut dead = 0u64;
     // Crossed and dead pixels of each column and row of the sensor.
     let (mut columns, mut rows) = (vec![[0u32; 2]; width], vec![[0u32; 2]; height]);
@@ -40,7 +48,8 @@ pub fn defect(decoded: &Decoded, pixels: &PixelCounts) -> Option<Reason> {
             }
             let corners =
                 || valid(x - 1, y - 1) && valid(x + 1, y - 1) && valid(x - 1, y + 1) && valid(x + 1, y + 1);
-            dead += u64::from(class_here == Class::Unlit && beside && above && corners());
+            let is_bright = || strong(x - 1, y) && strong(x + 1, y) && strong(x, y - 1) && strong(x, y + 1);
+            dead += u64::from(class_here == Class::Unlit && beside && above && corners() && is_bright());
         }
     }
     let lines = |counts: &[[u32; 2]]| {

@@ -324,14 +324,38 @@ fn a_pair_that_stays_suspicious_fails_the_scan_by_name() {
     let mut story = Story::begin(Mode::Pse);
     for _ in 0..3 {
         story.until(|action| *action == Action::Judge(Subject::Pair { group: 2 }));
-        story.tell(Event::Judged(Subject::Pair { group: 2 }, suspicious("flicker")));
+        story.tell(Event::Judged(Subject::Pair { group: 2 }, suspicious("torn-frame")));
     }
     let diagnosis = story.failure();
     assert_eq!(
         (diagnosis.reason.as_str(), diagnosis.role.unwrap().to_string()),
-        ("flicker", "column bit 0".into())
+        ("torn-frame", "column bit 0".into())
     );
-    assert_eq!(story.retakes(), [(2, "flicker", 1), (2, "flicker", 2)]);
+    assert_eq!(story.retakes(), [(2, "torn-frame", 1), (2, "torn-frame", 2)]);
+}
+
+#[test]
+fn light_that_stays_changed_is_noted_after_one_try_and_the_scan_goes_on() {
+    let mut story = Story::begin(Mode::Pse);
+    // Group 3 was under way when 2 was refused; by the time of 4 it is known that another try does not help.
+    for group in [2, 3, 2, 3, 4] {
+        story.until(|action| *action == Action::Judge(Subject::Pair { group }));
+        story.tell(Event::Judged(Subject::Pair { group }, suspicious("flicker")));
+    }
+    assert_eq!(story.outcome(), Outcome::Complete);
+    assert_eq!(story.retakes(), [(2, "flicker", 1), (3, "flicker", 1)]);
+    let findings: Vec<_> = story.machine.findings().iter().map(|finding| finding.reason.as_str()).collect();
+    assert_eq!(findings, ["flicker"; 3]);
+}
+
+#[test]
+fn a_dip_of_the_lamp_costs_one_try() {
+    let mut story = Story::begin(Mode::Pse);
+    story.until(|action| *action == Action::Judge(Subject::Pair { group: 2 }));
+    story.tell(Event::Judged(Subject::Pair { group: 2 }, suspicious("flicker")));
+    assert_eq!(story.outcome(), Outcome::Complete);
+    assert_eq!(story.retakes(), [(2, "flicker", 1)]);
+    assert!(story.machine.findings().is_empty());
 }
 
 #[test]

@@ -207,6 +207,9 @@ pub struct Processing {
     pub regions: Vec<NamedRegion>,
     /// Largest distance of a measured row from the predicted one, in projector px.
     pub row_gate_px: f64,
+    /// H over V that the rig shows on metal, where it is known.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub extinction_ratio: Option<f64>,
 }
 
 impl Default for Processing {
@@ -216,6 +219,7 @@ impl Default for Processing {
             volume: None,
             row_gate_px: DEFAULT_ROW_GATE_PX,
             regions: Vec::new(),
+            extinction_ratio: None,
         }
     }
 }

@@ -1,18 +1,24 @@
 //! Frames that do not show what they should, or not all of it.
 
+use polscan_patterns::Role;
 use serde_json::{Value, json};
 
 use super::{Case, all_evidence, names};
-use crate::report::{
-    diagnosis::{Diagnosis, Reason, look::Look},
-    statistics,
+use crate::{
+    evidence::{Cause, Frames, Look, STALE_SHARE, WHOLE_FRAME},
+    report::{
+        diagnosis::{Diagnosis, Reason},
+        statistics,
+    },
 };
 
-/// Residual as a share of the modulation from which on a frame shows another picture (1 is the ideal), not a rest of it.
-const STALE_SHARE: f64 = 0.5;
-/// Outliers of a pair from which on a whole frame is wrong. A frame that shows another pattern is wrong on a half of
-/// the pixels or more.
-const WHOLE_FRAME: f64 = 0.15;
+/// Outliers of a pair that is sound when its frames are looked for elsewhere, the share of the disturbed pairs for which
+/// that must hold, and the least number of them: fewer may fit by chance.
+const SOUND: f64 = 0.01;
+const FITTING: f64 = 0.7;
+const LEAST_FITTING: usize = 3;
+/// Share of the image that moved from which on the camera did, or the object as a whole.
+const MOVED: f64 = 0.25;
 /// Share of the coarse pairs up to which a disturbance came and went.
 const FEW_PAIRS: f64 = 0.15;
 /// How far the bad pixels of one pair are those of the next as well, 0 by chance and 1 for all, from which on something
@@ -20,9 +26,23 @@ const FEW_PAIRS: f64 = 0.15;
 const SAME_PIXELS: f64 = 0.4;
 
 /// Pixels that do not fit together on flat areas.
-pub(super) fn disturbance(disturbed: &[Case], coarse: usize) -> Reason {
+pub(super) fn disturbance(disturbed: &[Case], coarse: usize, frames: Option<Frames>) -> Reason {
+    if let Some(reason) = frames.and_then(|frames| arrival(disturbed, frames)) {
+        return reason;
+    }
     if disturbed.len() as f64 <= (FEW_PAIRS * coarse as f64).max(2.0) {
         return one_frame(disturbed);
+    }
+    let rests: Vec<f64> = disturbed
+        .iter()
+        .filter_map(|case| match case.look.as_ref()?.cause() {
+            Cause::Rest(rest) => Some(rest),
+            _ => None,
+        })
+        .collect();
+    if 2 * rests.len() > disturbed.len() {
+        let rest = statistics::median(&mut rests.clone()).unwrap_or(0.0);
+        return unsettled(disturbed, rest, all_evidence(disturbed));
     }
     let share = disturbed.iter().map(Case::share).fold(0.0, f64::max);
     let looks: Vec<&Look> = disturbed.iter().filter_map(|case| case.look.as_ref()).collect();
@@ -35,17 +55,7 @@ pub(super) fn disturbance(disturbed: &[Case], coarse: usize) -> Reason {
     let moved = same.map_or(share < WHOLE_FRAME, |same| same >= SAME_PIXELS);
     match strength {
         _ if moved => motion(disturbed, share, evidence),
-        Some(rest) if rest < STALE_SHARE => Reason::degraded(
-            Diagnosis::UnsettledDisplay,
-            format!(
-                "in {} the frames do not add up to the references: a rest of about {:.0} % of the picture before is \
-                 still on the glass; the display had not settled: run `polscan calibrate sync`, or hold each picture \
-                 for one refresh more",
-                names(disturbed),
-                100.0 * rest,
-            ),
-            evidence,
-        ),
+        Some(rest) if rest < STALE_SHARE => unsettled(disturbed, rest, evidence),
         _ => Reason::failed(
             Diagnosis::StaleFrame,
             format!(
@@ -60,17 +70,83 @@ pub(super) fn disturbance(disturbed: &[Case], coarse: usize) -> Reason {
     }
 }
 
+fn unsettled(disturbed: &[Case], rest: f64, evidence: Value) -> Reason {
+    Reason::degraded(
+        Diagnosis::UnsettledDisplay,
+        format!(
+            "in {} the frames do not add up to the references: a rest of about {:.0} % of the picture before is still on \
+             the glass; the display had not settled: run `polscan calibrate sync`, or hold each picture for one refresh \
+             more",
+            names(disturbed),
+            100.0 * rest,
+        ),
+        evidence,
+    )
+}
+
+/// Frames that fit when those of the place before or behind are taken for them: one was lost, or came twice. Both fit at
+/// once, as the pair before and the pair behind; what stands in the places of the last references tells which it is.
+fn arrival(disturbed: &[Case], frames: Frames) -> Option<Reason> {
+    let fits = |from: isize| {
+        let sound = disturbed.iter().filter(|case| {
+            let pair = case.view.pair;
+            let role = Role::Code { axis: pair.axis, bit: pair.bit, inverse: false };
+            let place = frames.all.iter().position(|(other, _)| *other == role);
+            let planes = place.and_then(|place| {
+                let first = place.checked_add_signed(from)?;
+                Some([frames.all.get(first)?.1, frames.all.get(first + 1)?.1])
+            });
+            let look = planes.and_then(|planes| frames.look_at(planes, true));
+            look.is_some_and(|look| look.unexplained < SOUND)
+        });
+        sound.count() as f64 >= FITTING * disturbed.len() as f64
+    };
+    if disturbed.len() < LEAST_FITTING || !(fits(-1) || fits(1)) {
+        return None;
+    }
+    let [bright, dark] = frames.all_references()?;
+    let ([first_bright, .., last_bright], [first_dark, .., last_dark]) = (&bright[..], &dark[..]) else {
+        return None;
+    };
+    let early = frames.are_alike(*last_dark, *first_bright);
+    let late = frames.are_alike(*last_bright, *first_dark);
+    let mut evidence = all_evidence(disturbed);
+    if early && !late {
+        evidence["off_by_frames"] = json!(1);
+        return Some(Reason::failed(
+            Diagnosis::LostFrame,
+            format!(
+                "{} fit when the frame before is taken for each; a frame was lost before them, and all that follow stand \
+                 one place too early: check cable and load of the camera, and scan again",
+                names(disturbed),
+            ),
+            evidence,
+        ));
+    }
+    late.then(|| {
+        evidence["off_by_frames"] = json!(-1);
+        Reason::failed(
+            Diagnosis::StaleFrame,
+            format!(
+                "{} fit when the frame behind is taken for each; a frame came twice or one picture too late, and all that \
+                 follow show the picture before: run `polscan calibrate sync`, and scan again",
+                names(disturbed),
+            ),
+            evidence,
+        )
+    })
+}
+
 /// A disturbance of one pair or two.
 fn one_frame(disturbed: &[Case]) -> Reason {
     let share = disturbed.iter().map(Case::share).fold(0.0, f64::max);
     let worst = disturbed.iter().max_by(|a, b| a.share().total_cmp(&b.share()));
-    let by_modulation = worst.and_then(Case::strength).is_none_or(|strength| strength >= STALE_SHARE);
-    if let Some(row) = worst.and_then(|case| case.look.as_ref()?.torn_at).filter(|_| by_modulation) {
-        return torn(disturbed, row);
-    }
-    match share >= WHOLE_FRAME && by_modulation {
-        true => stale(disturbed, share),
-        false => motion(disturbed, share, all_evidence(disturbed)),
+    match worst.and_then(|case| case.look.as_ref()).map(Look::cause) {
+        Some(Cause::Torn(row)) => torn(disturbed, row),
+        Some(Cause::OtherPicture) => stale(disturbed, share),
+        None if share >= WHOLE_FRAME => stale(disturbed, share),
+        Some(Cause::Rest(rest)) => unsettled(disturbed, rest, all_evidence(disturbed)),
+        _ => motion(disturbed, share, all_evidence(disturbed)),
     }
 }
 
@@ -115,8 +191,8 @@ fn motion(disturbed: &[Case], share: f64, evidence: Value) -> Reason {
         names(disturbed),
         100.0 * share,
     );
-    // Where most of the image moved, no part of it can be trusted.
-    match share > 0.5 {
+    // Where much of the image moved, no part of it can be trusted.
+    match share > MOVED {
         true => Reason::failed(Diagnosis::Motion, message, evidence),
         false => Reason::degraded(Diagnosis::Motion, message, evidence),
     }

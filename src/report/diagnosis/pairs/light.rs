@@ -1,21 +1,110 @@
 //! Light that changed between frames, steadily or to and fro.
 
+use polscan_patterns::Role;
 use serde_json::json;
 
 use super::{Case, View, all_evidence, names};
 use crate::{
     decode::Decoded,
+    evidence::{Frames, sample},
     report::{
-        diagnosis::{Diagnosis, Reason, look::Frames},
+        diagnosis::{Diagnosis, Reason},
         statistics,
     },
 };
+
+/// Whether the brightness of each frame answers to the frame before, as automatic exposure does: the step from one gain
+/// to the next falls with the logarithm of the mean of the former, by less than it rises.
+fn is_automatic(frames: Frames, coarse: &[View], shifted: &[Case]) -> bool {
+    let mut gains: Vec<(usize, f64)> = Vec::new();
+    for view in coarse {
+        let role = Role::Code { axis: view.pair.axis, bit: view.pair.bit, inverse: false };
+        let Some(place) = frames.all.iter().position(|(other, _)| *other == role) else { continue };
+        let case = shifted.iter().find(|case| std::ptr::eq(case.view.pair, view.pair));
+        let [p, q] = case.and_then(|case| case.look.as_ref()).map_or([0.0; 2], |look| look.gains);
+        gains.extend([(place, p), (place + 1, q)]);
+    }
+    gains.sort_by_key(|(place, _)| *place);
+    let mean = |place: usize| {
+        let plane = frames.all[place].1;
+        let step = (plane.len() / 10_000).max(1);
+        let count = plane.len().div_ceil(step).max(1) as f64;
+        let sum: f64 = (0..plane.len()).step_by(step).map(|at| sample(plane, at)).sum();
+        (sum / count - frames.decoded.black_level_dn).max(1.0)
+    };
+    // Per frame but the last: logarithm of its mean, of what its mean is at an even light, and the step to the next.
+    let mut steps: Vec<[f64; 3]> = Vec::new();
+    for two in gains.windows(2) {
+        let ((place, before), (next, after)) = (two[0], two[1]);
+        if next == place + 1 && before > -0.95 && after > -0.95 {
+            let mean = mean(place).ln();
+            steps.push([mean, mean - before.ln_1p(), after.ln_1p() - before.ln_1p()]);
+        }
+    }
+    if steps.len() < LEAST_STEPS {
+        return false;
+    }
+    let (with_mean, slope) = correlation(&steps, 0);
+    let (with_content, _) = correlation(&steps, 1);
+    with_mean < -ANSWERS && with_content < -ANSWERS_TO_CONTENT && (-SLOPE..0.0).contains(&slope)
+}
+
+/// Correlation of the steps with value `which`, and the slope of their line.
+fn correlation(steps: &[[f64; 3]], which: usize) -> (f64, f64) {
+    let count = steps.len() as f64;
+    let mean = |index: usize| steps.iter().map(|step| step[index]).sum::<f64>() / count;
+    let (x, y) = (mean(which), mean(2));
+    let sum =
+        |of: fn(f64, f64) -> f64| steps.iter().map(|step| of(step[which] - x, step[2] - y)).sum::<f64>();
+    let (xx, yy, xy) = (sum(|a, _| a * a), sum(|_, b| b * b), sum(|a, b| a * b));
+    (statistics::finite(xy / (xx * yy).sqrt()).unwrap_or(0.0), statistics::finite(xy / xx).unwrap_or(0.0))
+}
+
+/// Whether the light of the frames goes up and down more than once over, or a few frames stand out from the rest. A lamp
+/// that warms up and automatic exposure go one way; where the references were exposed otherwise than all pairs, as
+/// automatic exposure does, no few frames stand out.
+fn is_to_and_fro(coarse: &[View], shifted: &[Case]) -> bool {
+    if shifted.iter().all(|case| case.look.is_none()) {
+        return true;
+    }
+    let mut changes = Vec::new();
+    for view in coarse {
+        let case = shifted.iter().find(|case| std::ptr::eq(case.view.pair, view.pair));
+        match case.and_then(|case| case.look.as_ref()) {
+            Some(look) if look.is_offset => changes.extend([look.change; 2]),
+            Some(look) => changes.extend(look.gains),
+            None => changes.extend([0.0; 2]),
+        }
+    }
+    if shifted.iter().any(|case| !coarse.iter().any(|view| std::ptr::eq(case.view.pair, view.pair))) {
+        // A single fine pair.
+        return true;
+    }
+    let (low, high) = changes.iter().fold((f64::MAX, f64::MIN), |(l, h), &c| (l.min(c), h.max(c)));
+    let range = high - low;
+    let travel: f64 = changes.windows(2).map(|two| (two[1] - two[0]).abs()).sum();
+    let middle = statistics::median(&mut changes.clone()).unwrap_or(0.0);
+    let odd = changes.iter().filter(|&&change| (change - middle).abs() > 0.5 * range).count();
+    let few = odd as f64 <= FEW_FRAMES * changes.len() as f64 && middle.abs() < 0.3 * range;
+    travel >= TRAVEL * range || few
+}
 
 /// Correlation of the shifts with the order of the pairs from which on they are a drift rather than a flicker.
 const TREND: f64 = 0.8;
 /// Difference of first and last references, as a share of the modulation, from which on it is a reason: it moves a stripe
 /// edge by about a third of the 0.05 px that an edge should be good for.
 const DRIFT: f64 = 0.02;
+/// How many times its range the light must travel from frame to frame for going to and fro: once over is 1, up and down
+/// again 2.
+const TRAVEL: f64 = 2.5;
+/// Steps from frame to frame that automatic exposure is told by, how far they must go with the mean of the frame before
+/// and with its content at an even light, and the largest correction: all of the error.
+const LEAST_STEPS: usize = 8;
+const ANSWERS: f64 = 0.85;
+const ANSWERS_TO_CONTENT: f64 = 0.4;
+const SLOPE: f64 = 1.1;
+/// Share of the frames that are few.
+const FEW_FRAMES: f64 = 0.15;
 /// Share of the drift that the modulation must take part in for lamp or exposure to be its cause.
 const LAMP_SHARE: f64 = 0.5;
 
@@ -29,9 +118,13 @@ pub(super) fn brightness(
     let trend = trend(coarse);
     let drift = decoded.drift.and_then(statistics::finite);
     let drifted = drift.is_some_and(|drift| drift.abs() > DRIFT);
-    if drifted || (!shifted.is_empty() && trend.abs() >= TREND) {
+    let automatic = frames.is_some_and(|frames| is_automatic(frames, coarse, shifted));
+    let to_and_fro =
+        !shifted.is_empty() && !automatic && trend.abs() < TREND && is_to_and_fro(coarse, shifted);
+    let one_way = !shifted.is_empty() && (frames.is_some() || trend.abs() >= TREND);
+    if !to_and_fro && (drifted || one_way) {
         let modulation = frames.and_then(|frames| frames.modulation_drift());
-        return Some(drift_reason(drift, modulation, trend, shifted));
+        return Some(drift_reason(drift, modulation, trend, shifted, automatic));
     }
     if shifted.is_empty() {
         return None;
@@ -58,18 +151,41 @@ pub(super) fn brightness(
     ))
 }
 
-fn drift_reason(drift: Option<f64>, modulation: Option<f64>, trend: f64, shifted: &[Case]) -> Reason {
+fn drift_reason(
+    drift: Option<f64>,
+    modulation: Option<f64>,
+    trend: f64,
+    shifted: &[Case],
+    automatic: bool,
+) -> Reason {
     let seen = match drift {
         Some(drift) => {
             format!("the last references differ from the first by {:+.1} % of the modulation", 100.0 * drift)
         }
-        None => format!("the light changed steadily over {}", names(shifted)),
+        None => format!("the light changed over {}", names(shifted)),
     };
     let mut evidence = all_evidence(shifted);
     evidence["drift"] = json!(drift);
     evidence["modulation_drift"] = json!(modulation);
     evidence["trend"] = json!(trend);
-    let lamp = drift.zip(modulation).map(|(drift, modulation)| modulation.abs() >= LAMP_SHARE * drift.abs());
+    evidence["follows_the_frame_before"] = json!(automatic);
+    if automatic {
+        return Reason::degraded(
+            Diagnosis::ExposureDrift,
+            format!(
+                "{seen}, and each frame is the darker, the brighter the one before it was: the camera adjusts itself; switch \
+                 automatic exposure and gain off, and scan again"
+            ),
+            evidence,
+        );
+    }
+    let offsets = shifted.iter().filter_map(|case| case.look.as_ref()).filter(|look| look.is_offset).count();
+    let lamp = match drift.zip(modulation).filter(|(drift, _)| drift.abs() > DRIFT) {
+        Some((drift, modulation)) => Some(modulation.abs() >= LAMP_SHARE * drift.abs()),
+        None if shifted.iter().all(|case| case.look.is_none()) => None,
+        // First and last references agree: what lies between them tells.
+        None => Some(2 * offsets < shifted.len()),
+    };
     if lamp == Some(false) {
         return Reason::degraded(
             Diagnosis::AmbientDrift,

@@ -4,7 +4,8 @@
 use polscan_patterns::{Axis, Role};
 
 use crate::{
-    decode::{Class, DecodeSettings, Decoded, Plane},
+    decode::{Class, DecodeSettings, Decoded, NoiseModel, Plane},
+    grid::Grid,
     report::statistics,
 };
 
@@ -25,6 +26,14 @@ const LARGEST_CHANGE: f64 = 0.5;
 const EXPLAINED_SIGMA: f64 = 1.5;
 /// Where the modulation is less than this many sigma, another picture might not show.
 const ABLE_SIGMA: f64 = 8.0;
+/// Noise from pixel to pixel beyond this, in units of the noise assumed, shows that that is too small; and no more than
+/// the second is believed to be noise.
+const NOISY: f64 = 1.2;
+const NOISIEST: f64 = 6.0;
+/// Median difference of two frames of one picture, in sigma, at most: 0.67 by noise alone.
+const ALIKE_SIGMA: f64 = 2.0;
+/// About so many neighbours measure the noise.
+const NOISE_PAIRS: usize = 20_000;
 /// Fewer pixels than this show nothing.
 const LEAST_PIXELS: usize = 200;
 /// Without references, so many pairs are needed to tell a bad one from the others.
@@ -54,6 +63,8 @@ pub struct Frames<'a> {
     pub settings: &'a DecodeSettings,
     /// What came of it.
     pub decoded: &'a Decoded,
+    /// Whether the last references can be relied on as well as the first.
+    pub last_references: bool,
 }
 
 /// What a closer look at one pair shows.
@@ -65,10 +76,21 @@ pub struct Look {
     pub unexplained: f64,
     /// Spread of what that change leaves, in units of the noise.
     pub spread: f64,
+    /// Noise from one pixel to the next, in units of the noise assumed: 1 where the camera's noise is known. Outliers are
+    /// counted in units of the larger of the two.
+    pub noise: f64,
+    /// Whether light was added, rather than the projector's changed.
+    pub is_offset: bool,
+    /// Change of the projector's light in P and in Q.
+    pub gains: [f64; 2],
     /// The change, as a share of the light of a bright pixel.
     pub change: f64,
     /// Median over the outliers of the residual as a share of the modulation: 1 for another picture.
     pub strength: Option<f64>,
+    /// Robust spread of the same, as a share of it.
+    pub strength_spread: Option<f64>,
+    /// Share of the outliers that have the more common sign.
+    pub one_sided: f64,
     /// First image row below a tear.
     pub torn_at: Option<usize>,
     /// Whether each pixel looked at is an unexplained outlier; the same pixels for all pairs, `None` where not judged.
@@ -76,10 +98,15 @@ pub struct Look {
 }
 
 impl Look {
+    /// Share of the pixels that a change of brightness, if it is no absurd one, does not explain.
+    pub fn disturbed(&self) -> f64 {
+        if self.change.abs() < LARGEST_CHANGE { self.unexplained } else { self.outliers }
+    }
+
     /// Whether the frames differ in brightness from the others, and by nothing else.
     pub fn is_brightness(&self) -> bool {
         self.unexplained <= 0.1 * self.outliers
-            && self.spread <= EXPLAINED_SIGMA
+            && self.spread <= EXPLAINED_SIGMA * self.noise.max(1.0)
             && self.change.abs() < LARGEST_CHANGE
     }
 
@@ -103,12 +130,38 @@ impl Look {
 }
 
 impl<'a> Frames<'a> {
-    fn of(&self, wanted: Role) -> Vec<Plane<'a>> {
+    /// Frames of a role in the order of the sequence.
+    pub fn of(&self, wanted: Role) -> Vec<Plane<'a>> {
         self.all.iter().filter(|(role, _)| *role == wanted).map(|(_, plane)| *plane).collect()
     }
 
+    /// Whether two frames show the same picture, noise apart, on the lit pixels.
+    pub fn are_alike(&self, one: Plane<'a>, other: Plane<'a>) -> bool {
+        let class = self.decoded.class.data();
+        let black = self.decoded.black_level_dn;
+        let mut apart: Vec<f64> = (0..class.len())
+            .step_by((class.len() / NOISE_PAIRS).max(1))
+            .filter(|&at| usable(class[at]))
+            .map(|at| {
+                let levels = [sample(one, at), sample(other, at)].map(|dn| dn - black);
+                (levels[0] - levels[1]).abs()
+                    / (2.0 * self.decoded.noise.variance(levels[0].max(levels[1]))).sqrt()
+            })
+            .collect();
+        apart.len() >= LEAST_PIXELS && statistics::median(&mut apart).is_some_and(|apart| apart < ALIKE_SIGMA)
+    }
+
+    /// Bright and dark references that can be relied on, where there are both.
+    pub fn references(&self) -> Option<[Vec<Plane<'a>>; 2]> {
+        let mut found = self.all_references()?;
+        if !self.last_references {
+            found.iter_mut().for_each(|planes| planes.truncate(1));
+        }
+        Some(found)
+    }
+
     /// Bright and dark references, where there are both.
-    fn references(&self) -> Option<[Vec<Plane<'a>>; 2]> {
+    pub fn all_references(&self) -> Option<[Vec<Plane<'a>>; 2]> {
         let (bright, dark) = match self.settings.mode.is_polarized() {
             true => (Role::ReferenceH, Role::ReferenceV),
             false => (Role::White, Role::Black),
@@ -145,7 +198,42 @@ impl<'a> Frames<'a> {
         if matches!(&expected, Expected::Pairs(pairs) if pairs.len() < LEAST_PAIRS) {
             return None;
         }
-        Sampler { frames: self, pair, expected, flat_only }.look()
+        self.sampler(pair, expected, flat_only).look()
+    }
+
+    /// Residual of a pair in units of its noise, positive, at every pixel; NaN where it says nothing.
+    pub fn residual_map(&self, axis: Axis, bit: u8) -> Option<Grid<f32>> {
+        let frame = |inverse| self.of(Role::Code { axis, bit, inverse }).first().copied();
+        let pair = [frame(false)?, frame(true)?];
+        let sampler = self.sampler(pair, Expected::References(self.references()?), false);
+        let residuals = (0..sampler.width * sampler.height).map(|at| {
+            let pixel = sampler.pixel(at % sampler.width, at / sampler.width);
+            pixel.map_or(f32::NAN, |pixel| (pixel.residual / pixel.sigma).abs() as f32)
+        });
+        Some(Grid::from_vec(sampler.width, sampler.height, residuals.collect()))
+    }
+
+    /// Looks at two frames as if they were the pair, by the first references alone. `None` without them.
+    pub fn look_at(&self, pair: [Plane<'a>; 2], flat_only: bool) -> Option<Look> {
+        let [bright, dark] = self.references()?;
+        let first = [vec![*bright.first()?], vec![*dark.first()?]];
+        self.sampler(pair, Expected::References(first), flat_only).look()
+    }
+
+    fn sampler(&self, pair: [Plane<'a>; 2], expected: Expected<'a>, flat_only: bool) -> Sampler<'a> {
+        let decoded = self.decoded;
+        Sampler {
+            pair,
+            expected,
+            flat_only,
+            width: decoded.class.width(),
+            height: decoded.class.height(),
+            saturation_dn: self.settings.camera.saturation_dn,
+            black_dn: decoded.black_level_dn,
+            noise: decoded.noise,
+            class: Some(&decoded.class),
+            modulation: Some(&decoded.modulation),
+        }
     }
 
     /// Last less first modulation as a share of the modulation, median over the lit pixels.
@@ -171,7 +259,8 @@ fn usable(class: Class) -> bool {
     class.is_lit() && class != Class::Saturated
 }
 
-fn sample(plane: Plane<'_>, at: usize) -> f64 {
+/// Sample `at` of a plane in DN.
+pub fn sample(plane: Plane<'_>, at: usize) -> f64 {
     match plane {
         Plane::U8(samples) => f64::from(samples[at]),
         Plane::U16(samples) => f64::from(samples[at]),
@@ -206,8 +295,9 @@ impl Pixel {
         }
     }
 
-    fn is_outlier(&self, change: Change) -> bool {
-        self.left(change).abs() > OUTLIER_SIGMA * self.sigma
+    /// `unit`: the noise in units of that assumed.
+    fn is_outlier(&self, change: Change, unit: f64) -> bool {
+        self.left(change).abs() > OUTLIER_SIGMA * unit * self.sigma
     }
 }
 
@@ -232,19 +322,67 @@ enum Expected<'a> {
     Pairs(Vec<[Plane<'a>; 2]>),
 }
 
-struct Sampler<'a, 'b> {
-    frames: &'b Frames<'a>,
+/// One pair during a capture, with the references before it.
+#[derive(Clone, Copy)]
+pub struct Pair<'a> {
+    /// The frame and its inverse.
+    pub frames: [Plane<'a>; 2],
+    /// Bright and dark reference.
+    pub references: [Plane<'a>; 2],
+    /// Frame width in pixels.
+    pub width: usize,
+    /// Least value of a saturated sample.
+    pub saturation_dn: u16,
+    /// Dark level in DN.
+    pub black_dn: f64,
+    /// Noise of the camera.
+    pub noise: NoiseModel,
+}
+
+impl Pair<'_> {
+    /// Looks at it. `None` where too little light is seen, or frames differ in size.
+    pub fn look(&self, flat_only: bool) -> Option<Look> {
+        let len = self.frames[0].len();
+        let same = self.frames.iter().chain(&self.references).all(|plane| plane.len() == len);
+        if !same || self.width == 0 || !len.is_multiple_of(self.width) {
+            return None;
+        }
+        Sampler {
+            pair: self.frames,
+            expected: Expected::References(self.references.map(|plane| vec![plane])),
+            flat_only,
+            width: self.width,
+            height: len / self.width,
+            saturation_dn: self.saturation_dn,
+            black_dn: self.black_dn,
+            noise: self.noise,
+            class: None,
+            modulation: None,
+        }
+        .look()
+    }
+}
+
+struct Sampler<'a> {
     pair: [Plane<'a>; 2],
     expected: Expected<'a>,
     flat_only: bool,
+    width: usize,
+    height: usize,
+    saturation_dn: u16,
+    black_dn: f64,
+    noise: NoiseModel,
+    /// Classes of a decode; without one the references tell what is lit.
+    class: Option<&'a Grid<Class>>,
+    /// Its modulation.
+    modulation: Option<&'a Grid<f32>>,
 }
 
-impl Sampler<'_, '_> {
+impl Sampler<'_> {
     fn look(&self) -> Option<Look> {
-        let class = &self.frames.decoded.class;
-        let stride = (class.len() as f64 / PIXELS as f64).sqrt().ceil().max(1.0) as usize;
-        let rows: Vec<usize> = (0..class.height()).step_by(stride).collect();
-        let columns: Vec<usize> = (0..class.width()).step_by(stride).collect();
+        let stride = ((self.width * self.height) as f64 / PIXELS as f64).sqrt().ceil().max(1.0) as usize;
+        let rows: Vec<usize> = (0..self.height).step_by(stride).collect();
+        let columns: Vec<usize> = (0..self.width).step_by(stride).collect();
         let pixels: Vec<Option<Pixel>> = rows
             .iter()
             .flat_map(|&y| columns.iter().map(move |&x| (x, y)))
@@ -255,14 +393,26 @@ impl Sampler<'_, '_> {
             return None;
         }
         let (change, spread) = explain(&seen)?;
+        let noise = self.pixel_noise(&rows, &columns).unwrap_or(1.0);
+        let unit = if noise > NOISY { noise.min(NOISIEST) } else { 1.0 };
         let marks: Vec<Option<bool>> =
-            pixels.iter().map(|pixel| pixel.map(|pixel| pixel.is_outlier(change))).collect();
+            pixels.iter().map(|pixel| pixel.map(|pixel| pixel.is_outlier(change, unit))).collect();
         let share = |change: Change| {
-            seen.iter().filter(|pixel| pixel.is_outlier(change)).count() as f64 / seen.len() as f64
+            seen.iter().filter(|pixel| pixel.is_outlier(change, unit)).count() as f64 / seen.len() as f64
         };
-        let outliers = seen.iter().filter(|pixel| pixel.is_outlier(Change::NONE));
+        let outliers = seen.iter().filter(|pixel| pixel.is_outlier(Change::NONE, unit));
         let strengths =
             outliers.filter_map(|pixel| statistics::finite((pixel.residual / pixel.modulation).abs()));
+        let mut strengths: Vec<f64> = strengths.collect();
+        let brighter =
+            seen.iter().filter(|pixel| pixel.is_outlier(Change::NONE, unit) && pixel.residual > 0.0).count()
+                as f64;
+        let count = strengths.len().max(1) as f64;
+        let one_sided = brighter.max(count - brighter) / count;
+        let strength = statistics::median(&mut strengths);
+        let strength_spread = statistics::robust_sigma(&mut strengths)
+            .zip(strength)
+            .and_then(|(spread, strength)| statistics::finite(spread / strength));
         let by_row: Vec<[u32; 2]> = marks
             .chunks(columns.len().max(1))
             .map(|row| {
@@ -287,32 +437,61 @@ impl Sampler<'_, '_> {
                     offset / statistics::median(&mut bright)?
                 }
             },
-            strength: statistics::median(&mut strengths.collect::<Vec<_>>()),
+            noise,
+            is_offset: matches!(change, Change::Offset(_)),
+            gains: match change {
+                Change::Gain(gains) => gains,
+                Change::Offset(_) => [0.0; 2],
+            },
+            strength,
+            strength_spread,
+            one_sided,
             torn_at: tear(&by_row).map(|row| rows[row]),
             marks,
         })
     }
 
-    fn pixel(&self, x: usize, y: usize) -> Option<Pixel> {
-        let (decoded, settings) = (self.frames.decoded, self.frames.settings);
-        let (width, height) = (decoded.class.width(), decoded.class.height());
-        let at = y * width + x;
-        if !usable(decoded.class.data()[at]) {
+    /// Noise from one pixel to the next, which no picture, motion or lamp makes, in units of the noise assumed.
+    fn pixel_noise(&self, rows: &[usize], columns: &[usize]) -> Option<f64> {
+        let step = (rows.len() * columns.len() / NOISE_PAIRS).max(1);
+        let places = rows.iter().flat_map(|&y| columns.iter().map(move |&x| (x, y))).step_by(step);
+        let mut differences: Vec<f64> = places
+            .filter(|&(x, _)| x + 1 < self.width)
+            .filter_map(|(x, y)| {
+                let (one, next) = (self.pixel(x, y)?, self.pixel(x + 1, y)?);
+                Some((one.residual - next.residual) / one.sigma.hypot(next.sigma))
+            })
+            .collect();
+        if differences.len() < LEAST_PIXELS {
             return None;
         }
-        let saturation = f64::from(settings.camera.saturation_dn);
+        statistics::robust_sigma(&mut differences).and_then(statistics::finite)
+    }
+
+    fn pixel(&self, x: usize, y: usize) -> Option<Pixel> {
+        let (width, height) = (self.width, self.height);
+        let at = y * width + x;
+        if self.class.is_some_and(|class| !usable(class.data()[at])) {
+            return None;
+        }
+        let saturation = f64::from(self.saturation_dn);
         let level = |plane: Plane<'_>| {
-            Some(sample(plane, at)).filter(|&dn| dn < saturation).map(|dn| dn - decoded.black_level_dn)
+            Some(sample(plane, at)).filter(|&dn| dn < saturation).map(|dn| dn - self.black_dn)
         };
         let (p, q) = (level(self.pair[0])?, level(self.pair[1])?);
-        let mut variance = decoded.noise.variance(p) + decoded.noise.variance(q);
+        let mut variance = self.noise.variance(p) + self.noise.variance(q);
+        let mut modulation = self.modulation.map(|modulation| f64::from(modulation.data()[at]));
         let expected = match &self.expected {
             Expected::References(references) => {
                 let mut sum = 0.0;
+                if modulation.is_none() {
+                    let [bright, dark] = references;
+                    modulation = Some(level(*bright.first()?)? - level(*dark.first()?)?);
+                }
                 for planes in references {
                     let count = planes.len() as f64;
                     let mean = planes.iter().map(|plane| level(*plane)).sum::<Option<f64>>()? / count;
-                    variance += decoded.noise.variance(mean) / count;
+                    variance += self.noise.variance(mean) / count;
                     sum += mean;
                 }
                 sum
@@ -324,12 +503,12 @@ impl Sampler<'_, '_> {
                 statistics::median(&mut sums)?
             }
         };
-        let modulation = f64::from(decoded.modulation.data()[at]);
+        let modulation = modulation?;
         if modulation.abs() < ABLE_SIGMA * variance.sqrt() {
             return None;
         }
         if self.flat_only
-            && !self.is_flat([x, y], [width, height], (2.0 * decoded.noise.variance(p.max(q))).sqrt())
+            && !self.is_flat([x, y], [width, height], (2.0 * self.noise.variance(p.max(q))).sqrt())
         {
             return None;
         }
