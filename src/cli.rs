@@ -8,7 +8,7 @@ use polscan_patterns::Mode;
 use crate::{
     commands,
     config::{Layers, Override},
-    engine::Failure,
+    engine::{Failure, Recorded},
     report::NamedRegion,
 };
 
@@ -158,16 +158,17 @@ fn dispatch(cli: &Cli) -> Result<u8, Failure> {
             let settings = layers(&args.config, flags).load()?;
             commands::scan(&settings, &args.region, &args.out, cli.json)
         }
-        Command::Decode(args) => commands::decode(&commands::DecodeArgs {
-            bundle: &args.bundle,
-            calibration: args.calibration.as_deref(),
-            projector_left: args.projector_left,
-            calibration_unit_mm: args.calibration_unit_mm,
-            mode: args.mode,
-            regions: &args.region,
-            out: &args.out,
-            json: cli.json,
-        }),
+        Command::Decode(args) => {
+            let recorded = Recorded {
+                bundle: &args.bundle,
+                calibration: args.calibration.as_deref(),
+                projector_left: args.projector_left,
+                calibration_unit_mm: args.calibration_unit_mm,
+                mode: args.mode,
+                regions: &args.region,
+            };
+            commands::decode(&recorded, &args.out, cli.json)
+        }
         Command::Patterns(args) => {
             let settings = layers(&args.config, Vec::new()).load()?;
             commands::patterns(&settings, args.mode, args.size, &args.out, cli.json)

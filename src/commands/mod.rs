@@ -11,7 +11,7 @@ use std::{io::Write, path::Path};
 
 use crate::report::{self, Outputs, Report, Verdict};
 
-pub use decode::{DecodeArgs, decode};
+pub use decode::decode;
 pub use devices::{config_is_good, devices};
 pub use failure::{USAGE, exit_code, print_failure, print_usage};
 pub use patterns::{Size, patterns};

@@ -11,6 +11,7 @@ pub mod npy;
 pub mod npz;
 mod pnm;
 pub mod source;
+pub mod spool;
 pub mod time;
 
 pub use bundle::{BundleWriter, WriteTimings};

@@ -63,11 +63,13 @@ pub enum Diagnosis {
     Cancelled,
     /// The frames are there and cannot be decoded.
     DecodeFailed,
+    /// The program ended before the scan did.
+    Interrupted,
 }
 
 impl Diagnosis {
     /// All of them, in the order of the documentation.
-    pub const ALL: [Self; 21] = [
+    pub const ALL: [Self; 22] = [
         Self::StaleFrame,
         Self::LostFrame,
         Self::TornFrame,
@@ -89,6 +91,7 @@ impl Diagnosis {
         Self::CaptureUnproven,
         Self::Cancelled,
         Self::DecodeFailed,
+        Self::Interrupted,
     ];
 
     /// Its name in files.
@@ -115,6 +118,7 @@ impl Diagnosis {
             Self::CaptureUnproven => "capture-unproven",
             Self::Cancelled => "cancelled",
             Self::DecodeFailed => "decode-failed",
+            Self::Interrupted => "interrupted",
         }
     }
 
