@@ -12,6 +12,7 @@ pub mod geometry;
 pub mod grid;
 pub mod pipeline;
 pub mod report;
+pub mod scanner;
 pub mod sequencer;
 pub mod store;
 pub mod truth;

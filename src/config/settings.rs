@@ -1,6 +1,9 @@
 //! Validated settings: what the rest of the program works with.
 
-use std::path::{Path, PathBuf};
+use std::{
+    net::SocketAddr,
+    path::{Path, PathBuf},
+};
 
 use polscan_drivers::{
     camera::{CameraSettings, Region, TriggerSource},
@@ -39,6 +42,10 @@ pub struct Settings {
     pub thresholds: Thresholds,
     /// Simulated rig and its scene, where a driver needs it.
     pub sim: Option<(RigDescription, Scene)>,
+    /// Address of the REST interface.
+    pub listen: SocketAddr,
+    /// File of tokens, resolved against the folder of the configuration.
+    pub tokens: Option<PathBuf>,
 }
 
 /// Collects `(key, message)`.
@@ -52,6 +59,8 @@ impl Settings {
         let region = region(&raw.camera.region, faults);
         let sim = sim(&raw, folder, faults);
         let calibration = calibration(&raw.rig, folder, faults);
+        let tokens = (!raw.api.tokens.is_empty()).then(|| folder.join(&raw.api.tokens));
+        let listen = listen(&raw.api, tokens.is_some(), faults);
         if !faults.is_empty() {
             return None;
         }
@@ -74,6 +83,8 @@ impl Settings {
                 fit_edges: raw.decode.fit_edges,
             },
             sim,
+            listen: listen?,
+            tokens,
             raw,
         })
     }
@@ -100,13 +111,17 @@ fn check_ranges(raw: &Raw, faults: &mut Faults) {
     within("decode.row_gate_px", raw.decode.row_gate_px, 0.1, 1000.0, " px");
     within("volume.near_mm", raw.volume.near_mm, 1.0, 1e6, " mm");
     within("volume.far_mm", raw.volume.far_mm, 1.0, 1e6, " mm");
+    within("api.concurrency", raw.api.concurrency as f64, 1.0, 10_000.0, "");
+    within("api.streams", raw.api.streams as f64, 1.0, 10_000.0, "");
+    within("api.wait_limit_s", raw.api.wait_limit_s, 1.0, 86_400.0, " s");
+    within("api.idempotency_hours", raw.api.idempotency_hours, 0.01, 10_000.0, " h");
+    within("store.quota_gib", raw.store.quota_gib, 0.0, 1e6, " GiB");
+    within("store.min_free_gib", raw.store.min_free_gib, 0.0, 1e6, " GiB");
+    within("store.keep_days", raw.store.keep_days, 0.0, 1e6, " days");
+    within("scan.queue_capacity", raw.scan.queue_capacity as f64, 0.0, 10_000.0, " scans");
     if raw.volume.near_mm >= raw.volume.far_mm {
         let message = format!("{} is not beyond near_mm = {}", raw.volume.far_mm, raw.volume.near_mm);
         faults.push(("volume.far_mm".into(), message));
-    }
-    if raw.api.listen.parse::<std::net::SocketAddr>().is_err() {
-        let message = format!("`{}` is not an address and port such as 127.0.0.1:8631", raw.api.listen);
-        faults.push(("api.listen".into(), message));
     }
     if raw.store.dir.is_empty() {
         faults.push(("store.dir".into(), "empty; name a folder".into()));
@@ -116,6 +131,20 @@ fn check_ranges(raw: &Raw, faults: &mut Faults) {
         let message = "a simulated camera sees only a simulated projector; set both drivers to sim or none";
         faults.push(("camera.driver".into(), message.into()));
     }
+}
+
+/// Where to listen. Without tokens nobody but this machine is served, whatever stands before it.
+fn listen(api: &raw::Api, tokens: bool, faults: &mut Faults) -> Option<SocketAddr> {
+    let Ok(address) = api.listen.parse::<SocketAddr>() else {
+        let message = format!("`{}` is not an address and port such as 127.0.0.1:8631", api.listen);
+        faults.push(("api.listen".into(), message));
+        return None;
+    };
+    if !address.ip().is_loopback() && !tokens {
+        let message = format!("{address} can be reached from other machines: name a file of tokens in api.tokens");
+        faults.push(("api.listen".into(), message));
+    }
+    Some(address)
 }
 
 fn polarization(raw: &raw::Projector, faults: &mut Faults) -> Option<Polarization> {

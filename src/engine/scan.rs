@@ -141,6 +141,11 @@ impl Scan {
         self.decode.mode
     }
 
+    /// What the camera was set to.
+    pub fn applied(&self) -> &AppliedSettings {
+        &self.plan.applied
+    }
+
     /// Bytes of all its frames.
     pub fn frame_bytes(&self) -> u64 {
         let pixels = self.decode.width as u64 * self.decode.height as u64;
