@@ -65,6 +65,11 @@ impl EventLog {
         self.recent.lock().unwrap_or_else(PoisonError::into_inner).next
     }
 
+    /// Number of the oldest event that memory can have.
+    pub fn oldest(&self) -> u64 {
+        self.recent.lock().unwrap_or_else(PoisonError::into_inner).first
+    }
+
     /// The events after `cursor`, or `None` where memory does not reach back that far.
     pub fn after(&self, cursor: u64) -> Option<Vec<Arc<Event>>> {
         let recent = self.recent.lock().unwrap_or_else(PoisonError::into_inner);

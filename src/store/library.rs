@@ -191,6 +191,17 @@ impl Library {
         Ok((index, recovery))
     }
 
+    /// Makes the index again from the bundles, whatever it held. Scans that had not come to their end are settled first,
+    /// so that what was queued is all that is lost.
+    pub fn reindex(&self, now: &str) -> Result<(Index, Recovery), StorageError> {
+        if let Ok((index, settled)) = self.recover(now) {
+            drop(index);
+            tracing::info!(interrupted = settled.interrupted.len(), "what had not come to its end was settled");
+        }
+        self.set_index_aside()?;
+        self.recover(now)
+    }
+
     /// Moves a damaged index out of the way, for somebody to look at.
     fn set_index_aside(&self) -> Result<(), StorageError> {
         let path = self.folder.join(index::FILE_NAME);
