@@ -25,6 +25,7 @@ use super::{
     scans::find,
 };
 use crate::{
+    report::{Report, summary},
     scanner::Record,
     store::{
         Manifest,
@@ -104,7 +105,9 @@ fn no_artifact(name: &str) -> Problem {
 
 fn not_finished(record: &Record) -> Problem {
     let state = record.state.name();
-    Kind::NotFinished.with(format!("the scan is {state}; ask again when it is done, or wait with ?wait=done")).and("state", state)
+    Kind::NotFinished
+        .with(format!("the scan is {state}; ask again when it is done, or wait with ?wait=done"))
+        .and("state", state)
 }
 
 /// Finds a file by a name that the manifest lists.
@@ -181,7 +184,9 @@ fn header_text(headers: &HeaderMap, name: header::HeaderName) -> Option<&str> {
 /// Whether one of the tags of a header is this one.
 fn has_tag(header: Option<&str>, tag: &str) -> bool {
     header.is_some_and(|list| {
-        list.split(',').map(|item| item.trim().trim_start_matches("W/")).any(|item| item == "*" || item == tag)
+        list.split(',')
+            .map(|item| item.trim().trim_start_matches("W/"))
+            .any(|item| item == "*" || item == tag)
     })
 }
 
@@ -207,7 +212,8 @@ async fn serve(app: &App, id: &str, name: &str, headers: &HeaderMap) -> Result<R
             (StatusCode::PARTIAL_CONTENT, first, last - first + 1)
         }
         Span::Nothing => {
-            let mut response = Kind::Range.with(format!("the file has {} bytes", entry.bytes)).into_response();
+            let mut response =
+                Kind::Range.with(format!("the file has {} bytes", entry.bytes)).into_response();
             response.headers_mut().insert(header::CONTENT_RANGE, value(&format!("bytes */{}", entry.bytes)));
             return Ok(response);
         }
@@ -244,6 +250,25 @@ pub async fn get_artifact(
 ) -> Result<Response, Problem> {
     let Part((_, name)) = part.map_err(|_| no_artifact("that"))?;
     serve(&app, &id, &name, &headers).await
+}
+
+/// The result in words
+///
+/// What a person wants to know of a scan, as text of fixed width.
+#[utoipa::path(
+    get, path = "/v1/scans/{id}/summary.txt", tag = "artifacts", params(("id" = String, Path)),
+    responses(
+        (status = 200, description = "The summary", content_type = "text/plain", body = String),
+        (status = 404, description = "Unknown scan, or it has no report", body = ProblemBody, content_type = "application/problem+json"),
+        (status = 409, description = "Not yet", body = ProblemBody, content_type = "application/problem+json")))]
+pub async fn get_summary(Shared(app): Shared<App>, Id(id): Id) -> Result<Response, Problem> {
+    let found = locate(&app, &id, "report.json").await?;
+    let read = move || {
+        let report: Report = serde_json::from_slice(&std::fs::read(found.path).ok()?).ok()?;
+        Some(summary(&report, None))
+    };
+    let text = app.blocking(read).await?.ok_or_else(|| no_artifact("summary.txt"))?;
+    Ok(([(header::CONTENT_TYPE, "text/plain; charset=utf-8")], text).into_response())
 }
 
 /// A picture of a map
@@ -299,7 +324,10 @@ pub async fn get_bundle(Shared(app): Shared<App>, Id(id): Id) -> Result<Response
     let name = format!("attachment; filename=\"{}.zip\"", record.id);
     let headers = [
         (header::CONTENT_TYPE, HeaderValue::from_static("application/zip")),
-        (header::CONTENT_DISPOSITION, HeaderValue::from_str(&name).unwrap_or(HeaderValue::from_static("attachment"))),
+        (
+            header::CONTENT_DISPOSITION,
+            HeaderValue::from_str(&name).unwrap_or(HeaderValue::from_static("attachment")),
+        ),
     ];
     Ok((headers, Body::from_stream(stream)).into_response())
 }

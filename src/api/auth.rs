@@ -91,7 +91,9 @@ pub enum TokenError {
         line: usize,
     },
     /// A name that cannot be one.
-    #[error("`{0}` cannot name a token: use letters, digits, - and _, and a name that is not in the file yet")]
+    #[error(
+        "`{0}` cannot name a token: use letters, digits, - and _, and a name that is not in the file yet"
+    )]
     Name(String),
     /// There is no token.
     #[error("the token file {} has no token: make one with `polscan token add`", path.display())]
@@ -124,7 +126,8 @@ impl Tokens {
             return Err(TokenError::Mode { path: path.to_owned(), mode });
         }
         let text = std::fs::read_to_string(path).map_err(fail)?;
-        let lines = text.lines().enumerate().filter(|(_, line)| !line.trim().is_empty() && !line.starts_with('#'));
+        let lines =
+            text.lines().enumerate().filter(|(_, line)| !line.trim().is_empty() && !line.starts_with('#'));
         let tokens: Result<Vec<Token>, TokenError> = lines
             .map(|(index, line)| {
                 parse(line).ok_or_else(|| TokenError::Line { path: path.to_owned(), line: index + 1 })
@@ -225,7 +228,8 @@ impl Gate {
         let text = |name| headers.get(name).and_then(|value| value.to_str().ok());
         let host = text(header::HOST).or(uri.host());
         if !host.is_some_and(|host| self.is_own(host)) {
-            return Err(Kind::Foreign.with("the Host of the request is not this machine; without tokens only it is served"));
+            return Err(Kind::Foreign
+                .with("the Host of the request is not this machine; without tokens only it is served"));
         }
         if *method == Method::GET || *method == Method::HEAD {
             return Ok(());
@@ -255,7 +259,10 @@ fn check_token(tokens: &Tokens, needed: Scope, headers: &HeaderMap) -> Result<()
         kind.eq_ignore_ascii_case("bearer").then(|| secret.trim())
     });
     match bearer.and_then(|secret| tokens.scope(secret)) {
-        None => Err(Kind::Unauthorized.with("send `Authorization: Bearer TOKEN` with a token of `polscan token add`")),
+        None => {
+            Err(Kind::Unauthorized
+                .with("send `Authorization: Bearer TOKEN` with a token of `polscan token add`"))
+        }
         Some(scope) if scope < needed => {
             Err(Kind::Scope.with(format!("the token has scope {scope}, this needs {needed}")))
         }
@@ -273,10 +280,17 @@ mod tests {
         Gate { tokens, address: IpAddr::from([127, 0, 0, 1]) }
     }
 
-    fn status(gate: &Gate, method: Method, path: &str, headers: &[(&'static str, &str)]) -> Option<StatusCode> {
+    fn status(
+        gate: &Gate,
+        method: Method,
+        path: &str,
+        headers: &[(&'static str, &str)],
+    ) -> Option<StatusCode> {
         let headers = headers
             .iter()
-            .map(|(name, value)| (header::HeaderName::from_static(name), HeaderValue::from_str(value).unwrap()))
+            .map(|(name, value)| {
+                (header::HeaderName::from_static(name), HeaderValue::from_str(value).unwrap())
+            })
             .collect();
         gate.check(&method, &path.parse().unwrap(), &headers).err().map(|problem| problem.status())
     }
@@ -288,10 +302,13 @@ mod tests {
         for own in ["127.0.0.1:8631", "localhost:1", "LOCALHOST", "[::1]:8631", "127.0.0.1"] {
             assert_eq!(get(own), None, "{own}");
         }
-        for other in ["evil.example", "evil.example:8631", "127.0.0.1.evil.example", "localhost.evil", "10.0.0.1", ""] {
+        for other in
+            ["evil.example", "evil.example:8631", "127.0.0.1.evil.example", "localhost.evil", "10.0.0.1", ""]
+        {
             assert_eq!(get(other), Some(StatusCode::FORBIDDEN), "{other}");
         }
-        let post = |origin| status(&gate, Method::POST, "/v1/scans", &[("host", "localhost"), ("origin", origin)]);
+        let post =
+            |origin| status(&gate, Method::POST, "/v1/scans", &[("host", "localhost"), ("origin", origin)]);
         for own in ["http://localhost:8631", "http://127.0.0.1:3000", "https://[::1]"] {
             assert_eq!(post(own), None, "{own}");
         }
@@ -319,8 +336,13 @@ mod tests {
         ];
         for (method, path, needed) in cases {
             for (secret, scope) in secrets.iter().zip(Scope::ALL) {
-                let found = status(&gate, method.clone(), path, &[("authorization", &format!("Bearer {secret}"))]);
-                assert_eq!(found, (scope < needed).then_some(StatusCode::FORBIDDEN), "{method} {path} {scope}");
+                let found =
+                    status(&gate, method.clone(), path, &[("authorization", &format!("Bearer {secret}"))]);
+                assert_eq!(
+                    found,
+                    (scope < needed).then_some(StatusCode::FORBIDDEN),
+                    "{method} {path} {scope}"
+                );
             }
             for wrong in ["Bearer x", "Bearer ", "Basic x", ""] {
                 let found = status(&gate, method.clone(), path, &[("authorization", wrong)]);

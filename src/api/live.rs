@@ -167,7 +167,9 @@ async fn picture(app: &App, seen: u64) -> Result<Arc<Picture>, Problem> {
     let _ = timeout(FRESH, number.wait_for(|number| *number > seen)).await;
     let preview = app.scanner.preview.clone();
     let picture = app.blocking(move || preview.picture()).await?;
-    picture.ok_or_else(|| Kind::NoFrame.with("no frame has been taken yet; see /readyz for the state of the rig"))
+    picture.ok_or_else(|| {
+        Kind::NoFrame.with("no frame has been taken yet; see /readyz for the state of the rig")
+    })
 }
 
 /// The latest frame
@@ -220,7 +222,10 @@ pub async fn get_preview_stream(Shared(app): Shared<App>) -> Result<Response, Pr
                 picture = next => picture?,
                 _ = stopping.wait_for(|stopping| *stopping) => return None,
             };
-            let mut part = format!("--{BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {}\r\n", picture.jpeg.len());
+            let mut part = format!(
+                "--{BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {}\r\n",
+                picture.jpeg.len()
+            );
             hints(&picture).iter().for_each(|(name, value)| part.push_str(&format!("{name}: {value}\r\n")));
             let mut bytes = part.into_bytes();
             bytes.extend_from_slice(b"\r\n");

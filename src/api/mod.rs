@@ -10,6 +10,7 @@ mod problem;
 mod scans;
 mod server;
 mod system;
+mod wire;
 
 use std::{
     net::IpAddr,
@@ -93,7 +94,10 @@ impl App {
     }
 
     /// Runs what may block where that hurts nobody.
-    async fn blocking<T: Send + 'static>(&self, run: impl FnOnce() -> T + Send + 'static) -> Result<T, Problem> {
+    async fn blocking<T: Send + 'static>(
+        &self,
+        run: impl FnOnce() -> T + Send + 'static,
+    ) -> Result<T, Problem> {
         tokio::task::spawn_blocking(run).await.map_err(|error| {
             tracing::error!(%error, "a request ended in a defect");
             Kind::Internal.with("the request ended in a defect of the service; its log says more")
@@ -147,6 +151,7 @@ fn router() -> OpenApiRouter<App> {
         .routes(routes!(scans::cancel_scan))
         .routes(routes!(scans::reprocess_scan))
         .routes(routes!(artifacts::get_bundle))
+        .routes(routes!(artifacts::get_summary))
         .routes(routes!(artifacts::get_artifact))
         .routes(routes!(artifacts::get_map))
         .routes(routes!(scans::resume_queue))
@@ -239,7 +244,8 @@ impl Predicate for Compressible {
         B: axum::body::HttpBody,
     {
         let headers = response.headers();
-        let kind = headers.get(header::CONTENT_TYPE).and_then(|value| value.to_str().ok()).unwrap_or_default();
+        let kind =
+            headers.get(header::CONTENT_TYPE).and_then(|value| value.to_str().ok()).unwrap_or_default();
         let text = ["application/json", "text/html", "application/openmetrics-text", "text/javascript"];
         let long = response.body().size_hint().exact().is_none_or(|bytes| bytes > 1024);
         long && response.status() != StatusCode::PARTIAL_CONTENT
@@ -255,6 +261,9 @@ mod tests {
     #[test]
     fn the_committed_document_is_that_of_the_handlers() {
         let committed = include_str!("../../docs/openapi.json");
-        assert!(committed == openapi(), "docs/openapi.json is not up to date: polscan openapi > docs/openapi.json");
+        assert!(
+            committed == openapi(),
+            "docs/openapi.json is not up to date: polscan openapi > docs/openapi.json"
+        );
     }
 }

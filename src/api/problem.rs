@@ -193,7 +193,9 @@ impl From<Denied> for Problem {
             Denied::Unknown => Kind::UnknownScan.with("no scan has this identity; GET /v1/scans lists them"),
             Denied::State(state) => {
                 let state = state.name();
-                Kind::State.with(format!("the scan is {state}, which does not allow this")).and("state", state)
+                Kind::State
+                    .with(format!("the scan is {state}, which does not allow this"))
+                    .and("state", state)
             }
             Denied::Pinned => Kind::Pinned.with("PATCH it with \"pinned\": false first"),
             Denied::InUse => Kind::InUse.with("delete the scans that were decoded from it first"),
@@ -212,7 +214,10 @@ impl From<Denied> for Problem {
 
 /// The table in words, for the documentation.
 pub fn table() -> Vec<Value> {
-    TABLE.iter().map(|(_, slug, status, title)| json!({ "type": slug, "status": status, "title": title })).collect()
+    TABLE
+        .iter()
+        .map(|(_, slug, status, title)| json!({ "type": slug, "status": status, "title": title }))
+        .collect()
 }
 
 #[cfg(test)]

@@ -11,13 +11,14 @@ use axum::{
 use polscan_patterns::Mode;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
-use utoipa::{IntoParams, ToSchema};
+use utoipa::ToSchema;
 
 use super::{
     App,
-    artifacts::{Artifact, artifacts},
+    artifacts::artifacts,
     extract::{Body, Id, MaybeBody, Params},
     problem::{Kind, Problem, ProblemBody},
+    wire::{ListParams, Page, ReprocessRequest, Scan, ScanPatch, ScanRequest, Wait, WaitParams},
 };
 use crate::{
     scanner::{Change, MOST_REPEATS, Record, State, Submit},
@@ -28,101 +29,9 @@ const LONGEST_LABEL: usize = 200;
 const MOST_TAGS: usize = 32;
 const LONGEST_TAG: usize = 64;
 const LONGEST_KEY: usize = 255;
-const PAGE: usize = 50;
+const PAGE_SCANS: usize = 50;
 const LARGEST_PAGE: usize = 500;
 const EXPOSURE_US: std::ops::RangeInclusive<f64> = 1.0..=30e6;
-
-/// What a scan is asked for with. Everything may be left out.
-#[derive(Debug, Default, Serialize, Deserialize, ToSchema)]
-#[serde(deny_unknown_fields, default)]
-pub struct ScanRequest {
-    /// `pse`, `fast`, `paper` or `gray`; the configured mode where it is left out.
-    mode: Option<String>,
-    /// Name for a person.
-    label: Option<String>,
-    /// For sorting and searching.
-    tags: Vec<String>,
-    /// Exposure in microseconds, 1 to 30 000 000; the configured one where it is left out.
-    exposure_us: Option<f64>,
-    /// Number of scans, one after the other. Each is a scan of its own; the answer names the first and lists all.
-    repeat: Option<usize>,
-    /// Whether to wait for other scans instead of being refused.
-    queue: bool,
-}
-
-/// How a scan is decoded again.
-#[derive(Debug, Default, Serialize, Deserialize, ToSchema)]
-#[serde(deny_unknown_fields, default)]
-pub struct ReprocessRequest {
-    /// Mode, where it is not that of the recorded frames.
-    mode: Option<String>,
-    /// Name of the result; that of the source where it is left out.
-    label: Option<String>,
-    /// Tags of the result.
-    tags: Vec<String>,
-}
-
-/// What may be changed about a scan. What is left out stays.
-#[derive(Debug, Deserialize, ToSchema)]
-#[serde(deny_unknown_fields)]
-pub struct ScanPatch {
-    /// Name for a person; `null` removes it.
-    #[serde(default, deserialize_with = "given")]
-    #[schema(value_type = Option<String>)]
-    label: Option<Option<String>>,
-    /// All tags.
-    #[serde(default)]
-    tags: Option<Vec<String>>,
-    /// Whether retention leaves it alone.
-    #[serde(default)]
-    pinned: Option<bool>,
-}
-
-/// Tells `null` from what was left out.
-fn given<'de, D: serde::Deserializer<'de>>(input: D) -> Result<Option<Option<String>>, D::Error> {
-    Option::<String>::deserialize(input).map(Some)
-}
-
-/// What an answer waits for.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize, ToSchema)]
-#[serde(rename_all = "lowercase")]
-pub enum Wait {
-    /// All frames are taken: the object may move.
-    Acquired,
-    /// There is a result, or there will be none.
-    Done,
-}
-
-/// What an answer waits for.
-#[derive(Debug, Default, Deserialize, IntoParams)]
-#[into_params(parameter_in = Query)]
-pub struct WaitParams {
-    /// `acquired`: until the object may move; `done`: until the scan is at its end. After `api.wait_limit_s` the answer
-    /// comes in any case, and `state` says how far it is.
-    #[param(inline)]
-    pub wait: Option<Wait>,
-}
-
-/// A scan as it is answered.
-#[derive(Debug, Serialize, ToSchema)]
-pub struct Scan {
-    #[serde(flatten)]
-    record: Record,
-    /// Address of the scan.
-    href: String,
-    /// Its files; empty before there are any.
-    artifacts: Vec<Artifact>,
-    /// All scans of the request, where it asked for several.
-    #[serde(skip_serializing_if = "Vec::is_empty")]
-    scans: Vec<String>,
-}
-
-impl Scan {
-    fn new(record: &Record) -> Self {
-        let href = format!("/v1/scans/{}", record.id);
-        Self { record: record.clone(), href, artifacts: Vec::new(), scans: Vec::new() }
-    }
-}
 
 fn accepted(scan: &Scan) -> Response {
     let location = HeaderValue::from_str(&scan.href);
@@ -141,24 +50,35 @@ fn invalid(key: &str, message: impl Into<String>) -> Problem {
 
 fn mode(text: Option<&str>) -> Result<Option<Mode>, Problem> {
     let modes = [Mode::Pse, Mode::Fast, Mode::Paper, Mode::Gray].map(Mode::name).join(", ");
-    let parse = |text: &str| text.parse().map_err(|_| invalid("mode", format!("`{text}` is none of {modes}")));
+    let parse =
+        |text: &str| text.parse().map_err(|_| invalid("mode", format!("`{text}` is none of {modes}")));
     text.map(parse).transpose()
 }
 
 fn check_names(label: Option<&str>, tags: &[String]) -> Result<(), Problem> {
     let odd = |text: &str| text.chars().any(char::is_control);
     if label.is_some_and(|label| label.chars().count() > LONGEST_LABEL || odd(label)) {
-        return Err(invalid("label", format!("at most {LONGEST_LABEL} characters, none of them a control character")));
+        return Err(invalid(
+            "label",
+            format!("at most {LONGEST_LABEL} characters, none of them a control character"),
+        ));
     }
     let wrong = |tag: &String| tag.is_empty() || tag.chars().count() > LONGEST_TAG || odd(tag);
     if tags.len() > MOST_TAGS || tags.iter().any(wrong) {
-        return Err(invalid("tags", format!("at most {MOST_TAGS} tags of 1 to {LONGEST_TAG} characters each")));
+        return Err(invalid(
+            "tags",
+            format!("at most {MOST_TAGS} tags of 1 to {LONGEST_TAG} characters each"),
+        ));
     }
     Ok(())
 }
 
 /// The key of a request and the digest of what it asks for. A key may be quoted or not.
-fn key(headers: &HeaderMap, asked: &impl Serialize, about: &str) -> Result<Option<(String, String)>, Problem> {
+fn key(
+    headers: &HeaderMap,
+    asked: &impl Serialize,
+    about: &str,
+) -> Result<Option<(String, String)>, Problem> {
     let Some(value) = headers.get("idempotency-key") else { return Ok(None) };
     let text = value.to_str().unwrap_or_default().trim();
     let key = text.strip_prefix('"').and_then(|text| text.strip_suffix('"')).unwrap_or(text);
@@ -265,7 +185,9 @@ pub async fn find(app: &App, id: &str) -> Result<Arc<Record>, Problem> {
     }
     let wanted = id.to_owned();
     let found = app.read(move |index| index.get(&wanted)).await?;
-    found.map(Arc::new).ok_or_else(|| Kind::UnknownScan.with("no scan has this identity; GET /v1/scans lists them"))
+    found
+        .map(Arc::new)
+        .ok_or_else(|| Kind::UnknownScan.with("no scan has this identity; GET /v1/scans lists them"))
 }
 
 async fn with_artifacts(app: &App, record: &Record) -> Result<Scan, Problem> {
@@ -289,52 +211,23 @@ pub async fn get_scan(
     with_artifacts(&app, &record).await.map(Json)
 }
 
-/// Which scans are listed.
-#[derive(Debug, Default, Deserialize, IntoParams)]
-#[into_params(parameter_in = Query)]
-#[serde(deny_unknown_fields, default)]
-pub struct ListParams {
-    /// States, separated by commas.
-    state: Option<String>,
-    /// `ok`, `degraded` or `failed`.
-    verdict: Option<String>,
-    /// Mode.
-    mode: Option<String>,
-    /// Label, in full.
-    label: Option<String>,
-    /// Tags, separated by commas; a scan must have all of them.
-    tag: Option<String>,
-    /// Pinned or not.
-    pinned: Option<bool>,
-    /// Accepted at or after this time, RFC 3339, UTC.
-    since: Option<String>,
-    /// Accepted before this time, RFC 3339, UTC.
-    until: Option<String>,
-    /// Number of scans of a page, 1 to 500; 50 where it is left out.
-    limit: Option<usize>,
-    /// `next` of the page before.
-    cursor: Option<String>,
-}
-
-/// A page of scans, the newest first.
-#[derive(Debug, Serialize, ToSchema)]
-pub struct Page {
-    /// The scans; their files are listed by each scan itself.
-    scans: Vec<Scan>,
-    /// `cursor` of the next page; `null` on the last.
-    next: Option<String>,
-}
-
 fn filter(params: ListParams) -> Result<Filter, Problem> {
     let words = |text: Option<String>| -> Vec<String> {
-        text.iter().flat_map(|text| text.split(',')).filter(|word| !word.is_empty()).map(str::to_owned).collect()
+        text.iter()
+            .flat_map(|text| text.split(','))
+            .filter(|word| !word.is_empty())
+            .map(str::to_owned)
+            .collect()
     };
-    let state = |name: String| State::from_name(&name).ok_or_else(|| invalid("state", format!("`{name}` is no state")));
+    let state = |name: String| {
+        State::from_name(&name).ok_or_else(|| invalid("state", format!("`{name}` is no state")))
+    };
     let before = |cursor: String| {
         let (created, id) = cursor.split_once('~')?;
         Some((created.to_owned(), id.to_owned()))
     };
-    let cursor = params.cursor.map(|cursor| before(cursor).ok_or_else(|| invalid("cursor", "use `next` of a page")));
+    let cursor =
+        params.cursor.map(|cursor| before(cursor).ok_or_else(|| invalid("cursor", "use `next` of a page")));
     Ok(Filter {
         states: words(params.state).into_iter().map(state).collect::<Result<_, _>>()?,
         verdict: params.verdict,
@@ -358,7 +251,7 @@ pub async fn list_scans(
     Shared(app): Shared<App>,
     Params(params): Params<ListParams>,
 ) -> Result<Json<Page>, Problem> {
-    let limit = params.limit.unwrap_or(PAGE);
+    let limit = params.limit.unwrap_or(PAGE_SCANS);
     if !(1..=LARGEST_PAGE).contains(&limit) {
         return Err(invalid("limit", format!("1 to {LARGEST_PAGE}")));
     }

@@ -119,7 +119,8 @@ pub async fn get_status(Shared(app): Shared<App>) -> Json<Status> {
         _ if snapshot.capturing.is_some() || !snapshot.finishing.is_empty() => "scanning",
         _ => "idle",
     };
-    let held = snapshot.queue.iter().filter(|id| snapshot.scans.get(*id).is_some_and(|scan| scan.held)).count();
+    let held =
+        snapshot.queue.iter().filter(|id| snapshot.scans.get(*id).is_some_and(|scan| scan.held)).count();
     Json(Status {
         revision: snapshot.revision,
         ready: readiness.ready,
@@ -179,7 +180,9 @@ pub async fn get_devices(Shared(app): Shared<App>) -> Result<Json<Devices>, Prob
     let settings = app.settings.clone();
     // What a simulated rig consists of does not change, and finding out takes as long as building one.
     let listed = app.devices.get_or_try_init(|| async {
-        app.blocking(move || app::list(&settings)).await?.map_err(|error| Kind::NotReady.with(error.to_string()))
+        app.blocking(move || app::list(&settings))
+            .await?
+            .map_err(|error| Kind::NotReady.with(error.to_string()))
     });
     let (cameras, projectors) = listed.await?;
     let device = |listing: &Listing| Device {
@@ -222,7 +225,9 @@ pub async fn put_projector(
     Body(asked): Body<Projection>,
 ) -> Result<Json<Projection>, Problem> {
     let shown: Shown = asked.show.parse().map_err(|error: String| {
-        Kind::Invalid.with(format!("show: {error}")).and("errors", json!([{ "key": "show", "message": error }]))
+        Kind::Invalid
+            .with(format!("show: {error}"))
+            .and("errors", json!([{ "key": "show", "message": error }]))
     })?;
     app.scanner.show(shown, &asked.show).await?;
     Ok(Json(asked))
@@ -288,7 +293,9 @@ pub async fn post_calibration(
 ) -> Problem {
     match kind.map(|Part(kind)| kind) {
         Ok(kind) if ["rig", "sync", "noise", "polarization"].contains(&kind.as_str()) => Kind::Unsupported
-            .with(format!("the service does not calibrate {kind} yet; give it a calibration file in rig.calibration")),
+            .with(format!(
+                "the service does not calibrate {kind} yet; give it a calibration file in rig.calibration"
+            )),
         _ => Kind::NotFound.with("calibrations are rig, sync, noise and polarization"),
     }
 }

@@ -12,8 +12,8 @@ use crate::{
 
 /// Adds a token to a file and prints it: it cannot be shown again.
 pub fn add_token(file: &Path, name: &str, scope: Scope, json: bool) -> Result<u8, Failure> {
-    let token =
-        api::add_token(file, name, scope).map_err(|error| Failure::storage(format!("add the token {name}"), error))?;
+    let token = api::add_token(file, name, scope)
+        .map_err(|error| Failure::storage(format!("add the token {name}"), error))?;
     match json {
         true => say(serde_json::json!({ "name": name, "scope": scope.to_string(), "token": token })),
         false => say(token),
@@ -28,7 +28,9 @@ pub fn reindex(settings: &Settings, json: bool) -> Result<u8, Failure> {
     let (_, recovery) = library.reindex(&rfc3339_utc(SystemTime::now())).map_err(fail)?;
     let scans = recovery.found.len() + recovery.interrupted.len();
     match json {
-        true => say(serde_json::json!({ "store": library.folder(), "scans": scans, "interrupted": recovery.interrupted })),
+        true => say(
+            serde_json::json!({ "store": library.folder(), "scans": scans, "interrupted": recovery.interrupted }),
+        ),
         false => say(format_args!("{}: {scans} scans in the index", library.folder().display())),
     }
     Ok(0)

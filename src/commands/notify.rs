@@ -58,7 +58,8 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("notify");
         let name = format!("polscan-test-{}", std::process::id());
-        let addresses = [SocketAddr::from_pathname(&path).unwrap(), SocketAddr::from_abstract_name(name).unwrap()];
+        let addresses =
+            [SocketAddr::from_pathname(&path).unwrap(), SocketAddr::from_abstract_name(name).unwrap()];
         for address in addresses {
             let manager = UnixDatagram::bind_addr(&address).unwrap();
             let notify = Notify(Some((UnixDatagram::unbound().unwrap(), address)));

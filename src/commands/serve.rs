@@ -104,8 +104,13 @@ fn announce(address: SocketAddr, store: &Path, file: Option<&Path>, json: bool) 
         write().map_err(|error| Failure::storage("write the address file", error))?;
     }
     match json {
-        true => say(serde_json::json!({ "address": address, "url": format!("http://{address}"), "store": store })),
-        false => say(format_args!("polscan serves http://{address}/ (interface: /docs), scans in {}", store.display())),
+        true => {
+            say(serde_json::json!({ "address": address, "url": format!("http://{address}"), "store": store }))
+        }
+        false => say(format_args!(
+            "polscan serves http://{address}/ (interface: /docs), scans in {}",
+            store.display()
+        )),
     }
     Ok(())
 }
@@ -177,7 +182,9 @@ fn in_words(snapshot: &Snapshot) -> String {
     let rig = match (&snapshot.capturing, snapshot.rig.state) {
         (Some(id), _) => format!("scanning {id}"),
         (None, RigState::Connecting) => "opening the rig".to_owned(),
-        (None, RigState::Fault) => format!("cannot scan: {}", snapshot.rig.message.clone().unwrap_or_default()),
+        (None, RigState::Fault) => {
+            format!("cannot scan: {}", snapshot.rig.message.clone().unwrap_or_default())
+        }
         (None, _) if !snapshot.finishing.is_empty() => "decoding".to_owned(),
         (None, _) => "idle".to_owned(),
     };

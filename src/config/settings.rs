@@ -141,7 +141,8 @@ fn listen(api: &raw::Api, tokens: bool, faults: &mut Faults) -> Option<SocketAdd
         return None;
     };
     if !address.ip().is_loopback() && !tokens {
-        let message = format!("{address} can be reached from other machines: name a file of tokens in api.tokens");
+        let message =
+            format!("{address} can be reached from other machines: name a file of tokens in api.tokens");
         faults.push(("api.listen".into(), message));
     }
     Some(address)

@@ -20,11 +20,7 @@ use crate::{
 ///
 /// # Errors
 /// `Data` where the spool holds no frame or none that can be used, `Storage` where the bundle cannot be written.
-pub fn salvage(
-    spooled: Spooled,
-    reason: Reason,
-    writer: BundleWriter,
-) -> Result<report::Report, Failure> {
+pub fn salvage(spooled: Spooled, reason: Reason, writer: BundleWriter) -> Result<report::Report, Failure> {
     let fail = |error: Box<dyn std::error::Error + Send + Sync>| {
         Failure::data("use what an interrupted scan left", error)
     };

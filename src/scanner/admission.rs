@@ -100,7 +100,8 @@ pub fn admit(situation: &Situation, ask: Ask) -> Decision {
     if !situation.obstacles.is_empty() {
         return Decision::Refuse(Refusal::NotReady(situation.obstacles.clone()));
     }
-    let crowded = (situation.finishing >= MOST_FINISHING).then(|| situation.oldest_finishing.clone()).flatten();
+    let crowded =
+        (situation.finishing >= MOST_FINISHING).then(|| situation.oldest_finishing.clone()).flatten();
     let holder = situation.holder.clone().or(crowded);
     let waiting = situation.runnable + situation.held;
     let room = situation.capacity.saturating_sub(waiting);

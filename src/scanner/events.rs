@@ -103,7 +103,8 @@ mod tests {
         for _ in 0..5 {
             log.add(event);
         }
-        let ids = |cursor| log.after(cursor).map(|events| events.iter().map(|event| event.id).collect::<Vec<_>>());
+        let ids =
+            |cursor| log.after(cursor).map(|events| events.iter().map(|event| event.id).collect::<Vec<_>>());
         assert_eq!(ids(100), Some(vec![101, 102, 103, 104, 105]));
         assert_eq!(ids(103), Some(vec![104, 105]));
         assert_eq!(ids(105), Some(vec![]));

@@ -9,7 +9,10 @@ use std::{
 
 use polscan_patterns::Mode;
 
-use super::{owner::Message, rig::{Captured, said}};
+use super::{
+    owner::Message,
+    rig::{Captured, said},
+};
 use crate::{
     engine::{self, Failure, Label, Recorded},
     report::Report,

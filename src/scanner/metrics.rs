@@ -74,17 +74,40 @@ impl Metrics {
         let duration = "From acceptance to result";
         registry.register_with_unit("scan_duration", duration, Unit::Seconds, self.scan_duration.clone());
         let latency = "From trigger to frame in memory";
-        registry.register_with_unit("trigger_to_frame", latency, Unit::Seconds, self.trigger_to_frame.clone());
+        registry.register_with_unit(
+            "trigger_to_frame",
+            latency,
+            Unit::Seconds,
+            self.trigger_to_frame.clone(),
+        );
         let phase = "How far the last flip was off the grid of refreshes";
-        registry.register_with_unit("present_phase_error", phase, Unit::Seconds, self.present_phase_error.clone());
+        registry.register_with_unit(
+            "present_phase_error",
+            phase,
+            Unit::Seconds,
+            self.present_phase_error.clone(),
+        );
         registry.register("camera_up", "Whether the camera is open", self.camera_up.clone());
         registry.register("projector_up", "Whether the projector is open", self.projector_up.clone());
-        registry.register("camera_reconnects", "Times that the rig was opened again", self.camera_reconnects.clone());
+        registry.register(
+            "camera_reconnects",
+            "Times that the rig was opened again",
+            self.camera_reconnects.clone(),
+        );
         let free = "Free space on the disk of the store";
         registry.register_with_unit("storage_free", free, Unit::Bytes, self.storage_free.clone());
-        registry.register_with_unit("storage_used", "Space taken by scans", Unit::Bytes, self.storage_used.clone());
+        registry.register_with_unit(
+            "storage_used",
+            "Space taken by scans",
+            Unit::Bytes,
+            self.storage_used.clone(),
+        );
         registry.register("queue_depth", "Scans that wait", self.queue_depth.clone());
-        registry.register("retention_deleted_scans", "Scans deleted by retention", self.retention_deleted.clone());
+        registry.register(
+            "retention_deleted_scans",
+            "Scans deleted by retention",
+            self.retention_deleted.clone(),
+        );
         let build = Info::new([("version", env!("CARGO_PKG_VERSION"))]);
         registry.register("build", "The program", build);
     }
@@ -96,7 +119,9 @@ impl Metrics {
 
     /// Counts frames.
     pub fn frames(&self, camera: &str, status: &str, count: u64) {
-        self.frames.get_or_create(&[("camera", camera.to_owned()), ("status", status.to_owned())]).inc_by(count);
+        self.frames
+            .get_or_create(&[("camera", camera.to_owned()), ("status", status.to_owned())])
+            .inc_by(count);
     }
 
     /// Counts a request.

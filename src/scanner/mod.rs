@@ -23,8 +23,10 @@ mod admission;
 mod disk;
 mod events;
 mod finish;
+mod heartbeat;
 mod metrics;
 mod owner;
+mod prepared;
 mod preview;
 mod record;
 mod rig;
@@ -32,13 +34,16 @@ mod service;
 mod snapshot;
 mod state;
 
-pub use admission::{Ask, Decision, Holder, MOST_FINISHING, MOST_REPEATS, Obstacle, Refusal, Situation, admit};
+pub use admission::{
+    Ask, Decision, Holder, MOST_FINISHING, MOST_REPEATS, Obstacle, Refusal, Situation, admit,
+};
 pub use events::EventLog;
+pub use heartbeat::Heartbeat;
 pub use metrics::Metrics;
 pub use owner::{Change, Denied, Submit};
 pub use preview::{Exposure, Picture, Preview};
 pub use record::{Cause, Progress, Record, Series, is_id};
-pub use rig::{Heartbeat, Shown};
+pub use rig::Shown;
 pub use service::{Scanner, Threads, start};
 pub use snapshot::{RigState, RigStatus, Snapshot, StorageStatus};
 pub use state::State;

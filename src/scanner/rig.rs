@@ -6,21 +6,18 @@ use std::{
     path::PathBuf,
     sync::{
         Arc,
-        atomic::{AtomicU64, Ordering},
         mpsc::{Receiver, RecvTimeoutError, Sender},
     },
     time::{Duration, Instant},
 };
 
-use polscan_drivers::{
-    camera::{AppliedSettings, CameraInfo},
-    error::DeviceError,
-    projector::ProjectorInfo,
-};
+use polscan_drivers::{camera::CameraInfo, error::DeviceError, projector::ProjectorInfo};
 use polscan_patterns::{Mode, Picture, ProjectorSize, Role, Sequence};
 use tokio::sync::oneshot;
 
-use super::{disk, metrics::Metrics, owner::Message, preview::Preview};
+use super::{
+    disk, heartbeat::Heartbeat, metrics::Metrics, owner::Message, prepared::Prepared, preview::Preview,
+};
 use crate::{
     app::Rig,
     config::Settings,
@@ -179,46 +176,10 @@ pub struct Shared {
     pub heartbeat: Arc<Heartbeat>,
 }
 
-/// When a thread last gave a sign of life.
-#[derive(Debug)]
-pub struct Heartbeat {
-    start: Instant,
-    beat_ms: AtomicU64,
-}
-
-impl Default for Heartbeat {
-    fn default() -> Self {
-        Self { start: Instant::now(), beat_ms: AtomicU64::new(0) }
-    }
-}
-
-impl Heartbeat {
-    /// A sign of life.
-    pub fn beat(&self) {
-        self.beat_ms.store(self.start.elapsed().as_millis() as u64, Ordering::Relaxed);
-    }
-
-    /// Time since the last one.
-    pub fn age(&self) -> Duration {
-        self.start.elapsed().saturating_sub(Duration::from_millis(self.beat_ms.load(Ordering::Relaxed)))
-    }
-}
-
 /// An open rig and the scan that its camera is set for.
 struct Open {
     rig: Rig,
     prepared: Prepared,
-}
-
-/// A scan that can begin at once.
-struct Prepared {
-    mode: Mode,
-    exposure_us: Option<f64>,
-    calibration_changed: Option<std::time::SystemTime>,
-    /// Whether the camera may have other settings by now.
-    stale: bool,
-    scan: Arc<Scan>,
-    applied: AppliedSettings,
 }
 
 /// Runs until all senders of `commands` are gone.
@@ -244,7 +205,8 @@ pub fn run(shared: &Shared, commands: &Receiver<Command>) {
             }
             shared.heartbeat.beat();
         }
-        let wait = if open.is_none() { next_try.saturating_duration_since(Instant::now()).min(TICK) } else { TICK };
+        let wait =
+            if open.is_none() { next_try.saturating_duration_since(Instant::now()).min(TICK) } else { TICK };
         let command = match commands.recv_timeout(wait) {
             Ok(command) => command,
             Err(RecvTimeoutError::Timeout) => continue,
@@ -413,7 +375,10 @@ impl Open {
                 let sequences = modes.into_iter().map(|mode| Sequence::new(mode, size));
                 let able = sequences.filter_map(Result::ok).find(|sequence| sequence.can_show(role));
                 let sequence = able.ok_or_else(|| {
-                    Failure::data("hold a picture", format!("no mode shows {role} on a projector of this size"))
+                    Failure::data(
+                        "hold a picture",
+                        format!("no mode shows {role} on a projector of this size"),
+                    )
                 })?;
                 sequence.raster(role, polarization)
             }
@@ -436,41 +401,4 @@ impl Open {
         }
         disarmed.map(|_| ())
     }
-}
-
-impl Prepared {
-    fn new(base: &Settings, mode: Mode, exposure_us: Option<f64>, rig: &mut Rig) -> Result<Self, Failure> {
-        let mut settings = base.clone();
-        settings.mode = mode;
-        settings.raw.scan.mode = mode;
-        if let Some(exposure_us) = exposure_us {
-            settings.camera.exposure_us = exposure_us;
-            settings.raw.camera.exposure_us = exposure_us;
-        }
-        let calibration_changed = changed(base);
-        let scan = Arc::new(Scan::prepare(&settings, &[], rig)?);
-        let applied = scan.applied().clone();
-        Ok(Self { mode, exposure_us, calibration_changed, stale: false, scan, applied })
-    }
-
-    /// Prepares anew where the last preparation was for something else.
-    fn renew(
-        &mut self,
-        base: &Settings,
-        mode: Mode,
-        exposure_us: Option<f64>,
-        rig: &mut Rig,
-    ) -> Result<(), Failure> {
-        let same = self.mode == mode && self.exposure_us == exposure_us;
-        if self.stale || !same || self.calibration_changed != changed(base) {
-            self.stale = true;
-            *self = Self::new(base, mode, exposure_us, rig)?;
-        }
-        Ok(())
-    }
-}
-
-/// When the calibration file was last changed.
-fn changed(settings: &Settings) -> Option<std::time::SystemTime> {
-    std::fs::metadata(&settings.calibration.as_ref()?.path).ok()?.modified().ok()
 }

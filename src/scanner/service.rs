@@ -13,10 +13,9 @@ use std::{
 use tokio::sync::{oneshot, watch};
 
 use super::{
-    EventLog, Metrics, Preview, Record, Snapshot, disk,
-    finish,
+    EventLog, Heartbeat, Metrics, Preview, Record, Snapshot, disk, finish,
     owner::{Change, Denied, Message, Outlets, Owner, Submit},
-    rig::{self, Heartbeat, Shown},
+    rig::{self, Shown},
 };
 use crate::{
     config::Settings,
@@ -106,11 +105,18 @@ fn next_event(index: &Index) -> u64 {
     let reserved = index.number("events").ok().flatten().unwrap_or(0);
     let stored = index.event_range().ok().flatten().map_or(0, |(_, newest)| newest);
     // Reserved numbers that were not used are skipped only where the last of them may have been lost.
-    if stored > 0 && index.number("clean").ok().flatten() == Some(stored) { stored + 1 } else { reserved.max(stored) + 1 }
+    if stored > 0 && index.number("clean").ok().flatten() == Some(stored) {
+        stored + 1
+    } else {
+        reserved.max(stored) + 1
+    }
 }
 
 impl Scanner {
-    async fn ask<T>(&self, message: impl FnOnce(oneshot::Sender<Result<T, Denied>>) -> Message) -> Result<T, Denied> {
+    async fn ask<T>(
+        &self,
+        message: impl FnOnce(oneshot::Sender<Result<T, Denied>>) -> Message,
+    ) -> Result<T, Denied> {
         let (sender, receiver) = oneshot::channel();
         let gone = || Denied::Rig("the service is ending".to_owned());
         self.messages.send(message(sender)).map_err(|_| gone())?;

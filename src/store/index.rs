@@ -172,11 +172,17 @@ impl Index {
         values: impl rusqlite::Params,
         read: impl FnMut(&Row<'_>) -> rusqlite::Result<T>,
     ) -> Result<Vec<T>> {
-        let run = || self.connection.prepare_cached(sql)?.query_map(values, read)?.collect::<rusqlite::Result<_>>();
+        let run =
+            || self.connection.prepare_cached(sql)?.query_map(values, read)?.collect::<rusqlite::Result<_>>();
         run().map_err(|error| self.fail(operation, error))
     }
 
-    fn records(&self, operation: &'static str, sql: &str, values: impl rusqlite::Params) -> Result<Vec<Record>> {
+    fn records(
+        &self,
+        operation: &'static str,
+        sql: &str,
+        values: impl rusqlite::Params,
+    ) -> Result<Vec<Record>> {
         let texts: Vec<String> = self.rows(operation, sql, values, |row| row.get(0))?;
         let parse = |text: String| serde_json::from_str(&text).map_err(|e| self.unusable(e.to_string()));
         texts.into_iter().map(parse).collect()
@@ -206,7 +212,11 @@ impl Index {
         )?;
         self.execute("write tags", "DELETE FROM tags WHERE scan = ?1", [&record.id])?;
         for tag in &record.tags {
-            self.execute("write tags", "INSERT OR IGNORE INTO tags (scan, tag) VALUES (?1, ?2)", [&record.id, tag])?;
+            self.execute(
+                "write tags",
+                "INSERT OR IGNORE INTO tags (scan, tag) VALUES (?1, ?2)",
+                [&record.id, tag],
+            )?;
         }
         transaction.commit().map_err(|error| self.fail("write a scan", error))
     }
@@ -270,13 +280,16 @@ impl Index {
 
     /// Bytes of all bundles.
     pub fn bytes(&self) -> Result<u64> {
-        let sum = self.rows("sum up sizes", "SELECT coalesce(sum(bytes), 0) FROM scans", [], |row| row.get(0))?;
+        let sum =
+            self.rows("sum up sizes", "SELECT coalesce(sum(bytes), 0) FROM scans", [], |row| row.get(0))?;
         Ok(sum.first().map_or(0, |bytes: &i64| (*bytes).max(0) as u64))
     }
 
     /// Identities of all scans, and whether each has a bundle.
     pub fn ids(&self) -> Result<Vec<(String, bool)>> {
-        self.rows("list scans", "SELECT id, bytes IS NOT NULL FROM scans", [], |row| Ok((row.get(0)?, row.get(1)?)))
+        self.rows("list scans", "SELECT id, bytes IS NOT NULL FROM scans", [], |row| {
+            Ok((row.get(0)?, row.get(1)?))
+        })
     }
 
     /// Whether another scan was decoded from the frames of `id`.
@@ -289,7 +302,8 @@ impl Index {
     /// Scans that retention may delete, the oldest first: at their end, not pinned, with a bundle of their own that no
     /// other needs.
     pub fn deletable(&self, before: Option<&str>) -> Result<Vec<Record>> {
-        let sql = "SELECT record FROM scans AS one WHERE state IN ('done', 'failed', 'cancelled', 'interrupted')
+        let sql =
+            "SELECT record FROM scans AS one WHERE state IN ('done', 'failed', 'cancelled', 'interrupted')
                    AND NOT pinned AND bytes IS NOT NULL AND created < coalesce(?1, '9999')
                    AND NOT EXISTS (SELECT 1 FROM scans AS other WHERE other.source = one.id)
                    ORDER BY created, id";
@@ -316,7 +330,9 @@ impl Index {
         let found = self.rows("read events", "SELECT min(id), max(id) FROM events", [], |row| {
             Ok((row.get::<_, Option<i64>>(0)?, row.get::<_, Option<i64>>(1)?))
         })?;
-        Ok(found.first().and_then(|(low, high)| Some((low.as_ref().copied()? as u64, high.as_ref().copied()? as u64))))
+        Ok(found
+            .first()
+            .and_then(|(low, high)| Some((low.as_ref().copied()? as u64, high.as_ref().copied()? as u64))))
     }
 
     /// Forgets all but the newest events.
@@ -328,7 +344,8 @@ impl Index {
     /// A number by its name.
     pub fn number(&self, name: &str) -> Result<Option<u64>> {
         let query = || {
-            let mut statement = self.connection.prepare_cached("SELECT value FROM numbers WHERE name = ?1")?;
+            let mut statement =
+                self.connection.prepare_cached("SELECT value FROM numbers WHERE name = ?1")?;
             statement.query_row([name], |row| row.get::<_, i64>(0)).optional()
         };
         let found = query().map_err(|error| self.fail("read a number", error))?;
@@ -367,7 +384,8 @@ mod tests {
     use super::*;
 
     fn record(id: usize, state: State) -> Record {
-        let mut record = Record::new(format!("scan-{id:03}"), "pse".into(), format!("2026-01-01T00:00:{:02}Z", id / 2));
+        let mut record =
+            Record::new(format!("scan-{id:03}"), "pse".into(), format!("2026-01-01T00:00:{:02}Z", id / 2));
         record.state = state;
         record.label = Some(format!("label {}", id % 3));
         record.tags = (0..id % 4).map(|tag| format!("tag {tag}")).collect();

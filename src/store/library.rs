@@ -12,17 +12,18 @@
 //! ```
 
 use std::{
+    collections::BTreeSet,
     fs::{self, File, TryLockError},
     io::{self, Write},
     path::{Path, PathBuf},
 };
 
-use super::{bundle, error::StorageError, index, manifest, source::Policy, spool::Spooled};
+use super::{bundle, error::StorageError, index, manifest, spool::Spooled};
 use crate::{
     engine::Failure,
     report::{Diagnosis, Reason, Report},
     scanner::{Record, State, is_id},
-    store::{Bundle, BundleWriter, Index, IndexError},
+    store::{BundleWriter, Index, IndexError},
 };
 
 /// What the service knows of a scan, beside its bundle.
@@ -128,12 +129,10 @@ impl Library {
 
     /// Bytes of the bundle of a scan; `None` where there is none.
     pub fn bundle_bytes(&self, id: &str) -> Option<u64> {
-        let manifest = self.folder.join(id).join(manifest::FILE_NAME);
-        let own = fs::metadata(&manifest).ok()?.len();
-        let bundle = Bundle::open(&manifest, Policy::Local, None);
-        // A bundle without a single frame is no input, but its files are there all the same.
-        let files = bundle.map_or(0, |bundle| bundle.manifest().files.values().map(|file| file.bytes).sum());
-        Some(own + files)
+        let bytes = fs::read(self.folder.join(id).join(manifest::FILE_NAME)).ok()?;
+        let parsed = manifest::Manifest::parse(&bytes);
+        let files = parsed.map_or(0, |parsed| parsed.manifest.files.values().map(|file| file.bytes).sum());
+        Some(bytes.len() as u64 + files)
     }
 
     /// Opens the index, makes it again where it is missing or damaged, and brings index and disk to agree: bundles that
@@ -179,13 +178,17 @@ impl Library {
                 recovery.interrupted.push(id);
             }
         }
-        for id in on_disk {
-            if index.get(&id).map_err(fail)?.is_none()
-                && let Some(record) = self.read_record(&id)
-            {
-                index.put(&record).map_err(fail)?;
-                recovery.found.push(id);
-            }
+        let known: BTreeSet<String> = index.ids().map_err(fail)?.into_iter().map(|(id, _)| id).collect();
+        let mut newest = 0;
+        for id in on_disk.difference(&known) {
+            let Some(record) = self.read_record(id) else { continue };
+            index.put(&record).map_err(fail)?;
+            newest = newest.max(record.revision);
+            recovery.found.push(id.clone());
+        }
+        if new {
+            // Revisions are numbers of events, and go on growing where the index that counted them is lost.
+            index.set_number("events", newest).map_err(fail)?;
         }
         self.salvage_unknown(&index, now, &mut recovery).map_err(fail)?;
         Ok((index, recovery))
@@ -196,7 +199,10 @@ impl Library {
     pub fn reindex(&self, now: &str) -> Result<(Index, Recovery), StorageError> {
         if let Ok((index, settled)) = self.recover(now) {
             drop(index);
-            tracing::info!(interrupted = settled.interrupted.len(), "what had not come to its end was settled");
+            tracing::info!(
+                interrupted = settled.interrupted.len(),
+                "what had not come to its end was settled"
+            );
         }
         self.set_index_aside()?;
         self.recover(now)
@@ -217,10 +223,10 @@ impl Library {
     }
 
     /// Identities of all bundles.
-    fn ids_on_disk(&self) -> Result<std::collections::BTreeSet<String>, StorageError> {
+    fn ids_on_disk(&self) -> Result<BTreeSet<String>, StorageError> {
         let fail = |error| StorageError::file("list", &self.folder, error);
         let entries = fs::read_dir(&self.folder).map_err(fail)?;
-        let mut ids = std::collections::BTreeSet::new();
+        let mut ids = BTreeSet::new();
         for entry in entries {
             let name = entry.map_err(fail)?.file_name();
             if let Some(id) = name.to_str().filter(|name| is_id(name))
@@ -237,7 +243,9 @@ impl Library {
         let id = record.id.clone();
         if let Some(found) = self.bundle(&id).is_dir().then(|| self.read_record(&id)).flatten() {
             // The bundle was complete before the crash, the index only had not heard of it.
-            record = Record { revision: record.revision, ..found };
+            let Record { state, verdict, reasons, error, points, bytes, finished, .. } = found;
+            record.progress.frames = record.progress.of.max(found.progress.frames);
+            record = Record { state, verdict, reasons, error, points, bytes, finished, ..record };
             let _ = fs::remove_dir_all(self.spool(&id));
             return record;
         }
