@@ -1,9 +1,13 @@
 # Two commands are all that is needed: `make run` and `make test`. Both install what is missing first.
-.PHONY: run test captures foreign-plane fuzz accuracy faults install ci
+.PHONY: run serve test captures foreign-plane faults fuzz accuracy setup install ci
 
-run: ## build, scan the simulated rig, say where the results are
+run: ## build, serve the simulated rig, scan it over REST, say where the results are
 	@scripts/install build
 	@scripts/run
+
+serve: ## build and serve until Ctrl-C; CONFIG names another configuration than the simulated rig's
+	@scripts/install build
+	@scripts/serve $(CONFIG)
 
 test: ## every test that needs no device
 	@scripts/install test
@@ -29,8 +33,11 @@ accuracy: ## measure the scanner on the simulated rig, about 5 minutes; writes d
 	@scripts/install build
 	cargo run --locked --profile test --example accuracy
 
-install: ## system packages and the Python environment of the checks
+setup: ## system packages and the Python environment of the checks
 	@scripts/install test
+
+install: ## install program and systemd service; PREFIX and DESTDIR as usual
+	@scripts/install-service
 
 ci: ## what continuous integration runs
 	@.ci/run

@@ -1,15 +1,19 @@
 //! The command line: arguments in, exit code out. What the commands do lives in `commands`.
 
-use std::path::{Path, PathBuf};
+use std::{
+    io::IsTerminal,
+    path::{Path, PathBuf},
+};
 
 use clap::{Args, Parser, Subcommand};
 use polscan_patterns::Mode;
 
 use crate::{
+    api::Scope,
     commands,
     compare::Method,
     config::{Layers, Override},
-    engine::Failure,
+    engine::{DecodeRequest, Failure},
     report::NamedRegion,
 };
 
@@ -34,6 +38,16 @@ enum Command {
     Compare(Compare),
     /// Write the pattern images as PNG, with the manifest that describes them.
     Patterns(Patterns),
+    /// Run as a service with a REST interface.
+    Serve(Serve),
+    /// Access tokens of the service.
+    #[command(subcommand)]
+    Token(Token),
+    /// The service's store of scans.
+    #[command(subcommand)]
+    Store(Store),
+    /// Print the API document of the service.
+    Openapi,
     /// List cameras and projectors, usable or not.
     Devices(ConfigArgs),
     /// Report every fault of a configuration.
@@ -48,6 +62,42 @@ struct ConfigArgs {
     /// Configuration file; what it leaves out is as in config/default.toml.
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
+}
+
+#[derive(Debug, Args)]
+struct Serve {
+    #[command(flatten)]
+    config: ConfigArgs,
+    /// Address and port to listen on; port 0 takes a free one.
+    #[arg(long, value_name = "ADDRESS")]
+    listen: Option<String>,
+    /// Folder of the scans.
+    #[arg(long, value_name = "DIR")]
+    store: Option<String>,
+    /// File to write the address to, once it is listened on.
+    #[arg(long, value_name = "FILE")]
+    address_file: Option<PathBuf>,
+}
+
+#[derive(Debug, Subcommand)]
+enum Token {
+    /// Make a token and print it; the file keeps only its hash. A running service learns of it when it is started again.
+    Add {
+        /// Name of the token, for the one who looks after the file.
+        name: String,
+        /// read, scan or admin; each includes those before it.
+        #[arg(long)]
+        scope: Scope,
+        /// File of tokens, as in api.tokens; made with mode 0600 where it is missing.
+        #[arg(long, value_name = "FILE")]
+        file: PathBuf,
+    },
+}
+
+#[derive(Debug, Subcommand)]
+enum Store {
+    /// Make the index again from the bundles. The service must not run.
+    Reindex(ConfigArgs),
 }
 
 #[derive(Debug, Args)]
@@ -163,7 +213,7 @@ pub fn run() -> u8 {
             return commands::USAGE;
         }
     };
-    start_logging();
+    start_logging(matches!(cli.command, Command::Serve(_)));
     match dispatch(&cli) {
         Ok(code) => code,
         Err(failure) => {
@@ -173,11 +223,18 @@ pub fn run() -> u8 {
     }
 }
 
-/// Logs go to stderr; POLSCAN_LOG chooses what, as in `POLSCAN_LOG=polscan=debug`.
-fn start_logging() {
+/// Logs go to stderr; POLSCAN_LOG chooses what, as in `POLSCAN_LOG=polscan=debug`. A service says more than a command,
+/// and where nobody looks, one object of JSON a line.
+fn start_logging(service: bool) {
+    let usual = if service { "info" } else { "warn" };
     let filter = tracing_subscriber::EnvFilter::try_from_env("POLSCAN_LOG")
-        .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("warn"));
-    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).without_time().init();
+        .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new(usual));
+    let log = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr);
+    match (service, std::io::stderr().is_terminal()) {
+        (false, _) => log.without_time().init(),
+        (true, true) => log.init(),
+        (true, false) => log.json().init(),
+    }
 }
 
 fn dispatch(cli: &Cli) -> Result<u8, Failure> {
@@ -190,16 +247,17 @@ fn dispatch(cli: &Cli) -> Result<u8, Failure> {
             let settings = layers(&args.config, flags).load()?;
             commands::scan(&settings, &args.region, &args.out, cli.json)
         }
-        Command::Decode(args) => commands::decode(&commands::DecodeArgs {
-            bundle: &args.bundle,
-            calibration: args.calibration.as_deref(),
-            projector_left: args.projector_left,
-            calibration_unit_mm: args.calibration_unit_mm,
-            mode: args.mode,
-            regions: &args.region,
-            out: &args.out,
-            json: cli.json,
-        }),
+        Command::Decode(args) => {
+            let request = DecodeRequest {
+                bundle: &args.bundle,
+                calibration: args.calibration.as_deref(),
+                projector_left: args.projector_left,
+                calibration_unit_mm: args.calibration_unit_mm,
+                mode: args.mode,
+                regions: &args.region,
+            };
+            commands::decode(&request, &args.out, cli.json)
+        }
         Command::Compare(args) => {
             let bundles = args.bundles();
             let what = match bundles.is_empty() {
@@ -215,6 +273,19 @@ fn dispatch(cli: &Cli) -> Result<u8, Failure> {
             let settings = layers(&args.config, Vec::new()).load()?;
             commands::patterns(&settings, args.mode, args.size, &args.out, cli.json)
         }
+        Command::Serve(args) => {
+            let mut flags = Vec::new();
+            let listen = args.listen.as_deref();
+            flags.extend(listen.map(|listen| Override::flag("--listen", "api.listen", listen)));
+            flags.extend(args.store.as_deref().map(|dir| Override::flag("--store", "store.dir", dir)));
+            let settings = layers(&args.config, flags).load()?;
+            commands::serve(settings, args.address_file.as_deref(), cli.json)
+        }
+        Command::Token(Token::Add { name, scope, file }) => commands::add_token(file, name, *scope, cli.json),
+        Command::Store(Store::Reindex(args)) => {
+            commands::reindex(&layers(args, Vec::new()).load()?, cli.json)
+        }
+        Command::Openapi => Ok(commands::openapi()),
         Command::Devices(args) => commands::devices(&layers(args, Vec::new()).load()?, cli.json),
         Command::CheckConfig { file } => {
             let args = ConfigArgs { config: Some(file.clone()) };

@@ -1,6 +1,7 @@
 //! The scanner: from pattern to point cloud. Data flows one way:
 //! `patterns -> sequencer(projector, camera) -> frames -> decode -> geometry -> cloud -> report, store`.
 
+pub mod api;
 pub mod app;
 pub mod cli;
 pub mod cloud;
@@ -14,6 +15,7 @@ pub mod geometry;
 pub mod grid;
 pub mod pipeline;
 pub mod report;
+pub mod scanner;
 pub mod sequencer;
 pub mod store;
 pub mod truth;

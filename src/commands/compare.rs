@@ -4,18 +4,12 @@ use std::path::{Path, PathBuf};
 
 use polscan_patterns::Mode;
 
-use super::{
-    decode::{DecodeArgs, Recorded},
-    failure::FAILED,
-    progress::Bar,
-    say,
-    scan::cancel_on_interrupt,
-};
+use super::{failure::FAILED, progress::Bar, say, scan::cancel_on_interrupt};
 use crate::{
     app::{Rig, without_analyser},
     compare::{Comparison, Entry, Method, Places, Subject, page},
     config::Settings,
-    engine::{Failure, Results, Scan, rig_failure},
+    engine::{DecodeRequest, Failure, Recorded, Results, Scan, rig_failure},
     pipeline::{self, PipelineError},
     report::NamedRegion,
     sequencer::{CancelFlag, Progress},
@@ -186,15 +180,13 @@ fn recorded(bundles: &[(Method, PathBuf)], regions: &[NamedRegion]) -> Result<Ma
             Method::Paper => Mode::Paper,
             Method::Pse => Mode::Pse,
         };
-        let args = DecodeArgs {
+        let args = DecodeRequest {
             bundle: path,
             calibration: None,
             projector_left: false,
             calibration_unit_mm: 1.0,
             mode: None,
             regions,
-            out: Path::new(""),
-            json: false,
         };
         let operation = || format!("decode {}", path.display());
         let open =
@@ -206,7 +198,7 @@ fn recorded(bundles: &[(Method, PathBuf)], regions: &[NamedRegion]) -> Result<Ma
             own.filter(|_| !as_recorded).map(|own| format!("recorded in mode {own}, decoded in mode {mode}"));
         let remarks: Vec<String> = remarks.into_iter().collect();
         let mode = (!as_recorded).then_some(mode);
-        let args = DecodeArgs { mode, ..args };
+        let args = DecodeRequest { mode, ..args };
         let recorded = Recorded::read(&args, open(mode)?)?;
         let (job, context) = (recorded.job(), recorded.context());
         let outcome =

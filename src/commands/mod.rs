@@ -1,25 +1,30 @@
 //! What each command of the program does: reads, calls the pure parts, writes, prints.
 
+mod admin;
 mod check_config;
 mod compare;
 mod decode;
 mod devices;
 mod failure;
+mod notify;
 mod patterns;
 mod progress;
 mod scan;
+mod serve;
 
 use std::{io::Write, path::Path};
 
 use crate::report::{self, Outputs, Report, Verdict};
 
+pub use admin::{add_token, openapi, reindex};
 pub use check_config::check_config;
 pub use compare::{CompareArgs, compare};
-pub use decode::{DecodeArgs, decode};
+pub use decode::decode;
 pub use devices::devices;
 pub use failure::{USAGE, exit_code, print_failure, print_usage};
 pub use patterns::{Size, patterns};
 pub use scan::scan;
+pub use serve::serve;
 
 /// Prints a line to stdout. A reader that has gone away is no error of ours.
 fn say(text: impl std::fmt::Display) {

@@ -39,6 +39,16 @@ pub struct Raw {
 pub struct Api {
     /// Address and port.
     pub listen: String,
+    /// File of tokens, relative to the configuration file; empty for none.
+    pub tokens: String,
+    /// Requests at once.
+    pub concurrency: usize,
+    /// Streams at once.
+    pub streams: usize,
+    /// Longest wait for a scan in seconds.
+    pub wait_limit_s: f64,
+    /// How long idempotency keys are kept, in hours.
+    pub idempotency_hours: f64,
 }
 
 /// `[store]`
@@ -47,6 +57,14 @@ pub struct Api {
 pub struct Store {
     /// Folder of the scans.
     pub dir: String,
+    /// Most that the scans may take in GiB, 0 = no limit.
+    pub quota_gib: f64,
+    /// Space to leave free in GiB.
+    pub min_free_gib: f64,
+    /// Days to keep a scan, 0 = for ever.
+    pub keep_days: f64,
+    /// Whether the oldest scans make room for new ones.
+    pub delete_oldest: bool,
 }
 
 /// `[scan]`
@@ -55,6 +73,10 @@ pub struct Store {
 pub struct Scan {
     /// Mode where none is asked for.
     pub mode: Mode,
+    /// Scans that may wait.
+    pub queue_capacity: usize,
+    /// Whether scans queued before a restart run by themselves.
+    pub resume_queue: bool,
 }
 
 /// `[rig]`

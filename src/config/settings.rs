@@ -1,6 +1,9 @@
 //! Validated settings: what the rest of the program works with.
 
-use std::path::{Path, PathBuf};
+use std::{
+    net::SocketAddr,
+    path::{Path, PathBuf},
+};
 
 use polscan_drivers::{
     camera::{CameraSettings, Region, TriggerSource},
@@ -44,6 +47,10 @@ pub struct Settings {
     pub replay: Option<PathBuf>,
     /// Simulated rig and its scene, where a driver needs it.
     pub sim: Option<(RigDescription, Scene)>,
+    /// Address of the REST interface.
+    pub listen: SocketAddr,
+    /// File of tokens, resolved against the folder of the configuration.
+    pub tokens: Option<PathBuf>,
 }
 
 impl Settings {
@@ -65,6 +72,8 @@ impl Settings {
         let sim = sim(&raw, folder, faults);
         let replay = replay(&raw, folder, faults);
         let calibration = calibration(&raw.rig, folder, faults);
+        let tokens = (!raw.api.tokens.is_empty()).then(|| folder.join(&raw.api.tokens));
+        let listen = listen(&raw.api, tokens.is_some(), faults);
         if !faults.is_empty() {
             return None;
         }
@@ -88,6 +97,8 @@ impl Settings {
             },
             replay,
             sim,
+            listen: listen?,
+            tokens,
             raw,
         })
     }
@@ -115,13 +126,17 @@ fn check_ranges(raw: &Raw, faults: &mut Faults) {
     within("rig.extinction_ratio", raw.rig.extinction_ratio, 0.0, 1e6, "");
     within("volume.near_mm", raw.volume.near_mm, 1.0, 1e6, " mm");
     within("volume.far_mm", raw.volume.far_mm, 1.0, 1e6, " mm");
+    within("api.concurrency", raw.api.concurrency as f64, 1.0, 10_000.0, "");
+    within("api.streams", raw.api.streams as f64, 1.0, 10_000.0, "");
+    within("api.wait_limit_s", raw.api.wait_limit_s, 1.0, 86_400.0, " s");
+    within("api.idempotency_hours", raw.api.idempotency_hours, 0.01, 10_000.0, " h");
+    within("store.quota_gib", raw.store.quota_gib, 0.0, 1e6, " GiB");
+    within("store.min_free_gib", raw.store.min_free_gib, 0.0, 1e6, " GiB");
+    within("store.keep_days", raw.store.keep_days, 0.0, 1e6, " days");
+    within("scan.queue_capacity", raw.scan.queue_capacity as f64, 0.0, 10_000.0, " scans");
     if raw.volume.near_mm >= raw.volume.far_mm {
         let message = format!("{} is not beyond near_mm = {}", raw.volume.far_mm, raw.volume.near_mm);
         faults.push(("volume.far_mm".into(), message));
-    }
-    if raw.api.listen.parse::<std::net::SocketAddr>().is_err() {
-        let message = format!("`{}` is not an address and port such as 127.0.0.1:8631", raw.api.listen);
-        faults.push(("api.listen".into(), message));
     }
     if raw.store.dir.is_empty() {
         faults.push(("store.dir".into(), "empty; name a folder".into()));
@@ -135,6 +150,21 @@ fn check_ranges(raw: &Raw, faults: &mut Faults) {
             break;
         }
     }
+}
+
+/// Where to listen. Without tokens nobody but this machine is served, whatever stands before it.
+fn listen(api: &raw::Api, tokens: bool, faults: &mut Faults) -> Option<SocketAddr> {
+    let Ok(address) = api.listen.parse::<SocketAddr>() else {
+        let message = format!("`{}` is not an address and port such as 127.0.0.1:8631", api.listen);
+        faults.push(("api.listen".into(), message));
+        return None;
+    };
+    if !address.ip().is_loopback() && !tokens {
+        let message =
+            format!("{address} can be reached from other machines: name a file of tokens in api.tokens");
+        faults.push(("api.listen".into(), message));
+    }
+    Some(address)
 }
 
 fn polarization(raw: &raw::Projector, faults: &mut Faults) -> Option<Polarization> {

@@ -4,9 +4,13 @@
 
 mod failure;
 mod pictures;
+mod recorded;
 mod results;
+mod salvage;
 mod scan;
 
 pub use failure::{Failure, Kind};
+pub use recorded::{DecodeRequest, Recorded, decode};
 pub use results::{Results, new_id, write, write_unfinished};
+pub use salvage::salvage;
 pub use scan::{Label, Scan, Taken, rig_failure};

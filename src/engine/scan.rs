@@ -6,7 +6,7 @@ use polscan_drivers::{
     camera::{AppliedSettings, CameraInfo},
     projector::ProjectorInfo,
 };
-use polscan_patterns::{ProjectorSize, Role, Sequence};
+use polscan_patterns::{Mode, ProjectorSize, Role, Sequence};
 
 use super::{
     Failure,
@@ -173,11 +173,38 @@ impl Scan {
         self.plan.sequence.roles.len()
     }
 
+    /// Mode of the sequence.
+    pub fn mode(&self) -> Mode {
+        self.decode.mode
+    }
+
+    /// What the camera was set to.
+    pub fn applied(&self) -> &AppliedSettings {
+        &self.plan.applied
+    }
+
+    /// Bytes of all its frames.
+    pub fn frame_bytes(&self) -> u64 {
+        let pixels = self.decode.width as u64 * self.decode.height as u64;
+        let sample_bytes = if self.decode.camera.bit_depth > 8 { 2 } else { 1 };
+        pixels * self.frames() as u64 * sample_bytes
+    }
+
+    /// What a spool of this scan begins with: the manifest as far as it is known before the first frame, and the
+    /// calibration.
+    pub fn preface(&self, label: Label) -> Result<(Vec<u8>, Option<String>), Failure> {
+        let mut manifest = self.manifest(label);
+        manifest.record_decode(&self.decode);
+        let nothing = partial_record(&self.plan, PartialCapture::default());
+        manifest.record_capture(&nothing, self.settings.camera.clone());
+        let json = manifest.to_json().map_err(|error| Failure::storage("spool the scan", error))?;
+        Ok((json, self.calibration.as_ref().map(Calibration::to_toml)))
+    }
+
     /// Bytes that the result may need on the disk, generously.
     pub fn bytes(&self) -> u64 {
         let pixels = self.decode.width as u64 * self.decode.height as u64;
-        let sample_bytes = if self.decode.camera.bit_depth > 8 { 2 } else { 1 };
-        pixels * (self.frames() as u64 * sample_bytes + RESULT_BYTES_PER_PIXEL)
+        self.frame_bytes() + pixels * RESULT_BYTES_PER_PIXEL
     }
 
     /// Captures all frames. Blocks until the last one has come, or something stands in the way, or `cancel` asks to stop;

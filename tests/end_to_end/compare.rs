@@ -7,7 +7,7 @@ use crate::rig::{Rig, json, polscan, text};
 #[test]
 fn three_scans_of_the_twin_become_a_page_and_figures() {
     let rig = Rig::small();
-    let config = rig.written();
+    let config = rig.config();
     let out = rig.path("compared");
     let run = polscan(&["compare", "--config", text(&config), "--out", text(&out), "--json"]).expect(0);
     let printed: serde_json::Value = serde_json::from_str(&run.stdout).expect("one object");
@@ -82,7 +82,7 @@ fn bundles_are_compared_with_what_they_have() {
     polscan(&["compare", "--pse", text(&bundle), "--out", text(&inside)]).expect(74);
     let none = rig.path("none");
     polscan(&["compare", "--raw", text(&none), "--out", text(&rig.path("other"))]).expect(65);
-    let config = rig.written();
+    let config = rig.config();
     let both = ["compare", "--config", text(&config), "--pse", text(&bundle), "--out", text(&none)];
     polscan(&both).expect(2);
     polscan(&["compare", "--out", text(&none)]).expect(64);

@@ -65,8 +65,8 @@ impl Rig {
         self.folder.path().join(name)
     }
 
-    /// The configuration as a file.
-    pub fn written(&self) -> PathBuf {
+    /// Writes the configuration as it is now, and says where.
+    pub fn config(&self) -> PathBuf {
         let config = self.path("rig.toml");
         fs::write(&config, toml::to_string(&self.config).expect("a table is TOML"))
             .expect("the configuration");
@@ -75,7 +75,7 @@ impl Rig {
 
     /// Runs `polscan scan` into the folder `out`.
     pub fn scan(&self, out: &str, arguments: &[&str]) -> Run {
-        let config = self.written();
+        let config = self.config();
         let mut all = vec!["scan", "--config", text(&config), "--out"];
         let out = self.path(out);
         all.push(text(&out));

@@ -103,7 +103,7 @@ pub fn record(rig: &Rig, mode: Option<&str>, out: &str) {
 
 fn settings(rig: &Rig, mode: Option<&str>) -> Settings {
     let overrides = mode.map(|mode| Override::flag("--mode", "scan.mode", mode)).into_iter().collect();
-    Layers { file: Some(rig.written()), overrides }.load().expect("a sound configuration")
+    Layers { file: Some(rig.config()), overrides }.load().expect("a sound configuration")
 }
 
 /// Header of numpy's format 1.0.

@@ -67,11 +67,13 @@ pub enum Diagnosis {
     Cancelled,
     /// The frames are there and cannot be decoded.
     DecodeFailed,
+    /// The program ended before the scan did.
+    Interrupted,
 }
 
 impl Diagnosis {
     /// All of them, in the order of the documentation.
-    pub const ALL: [Self; 22] = [
+    pub const ALL: [Self; 23] = [
         Self::StaleFrame,
         Self::LostFrame,
         Self::TornFrame,
@@ -94,6 +96,7 @@ impl Diagnosis {
         Self::NoiseModel,
         Self::Cancelled,
         Self::DecodeFailed,
+        Self::Interrupted,
     ];
 
     /// Its name in files.
@@ -121,6 +124,7 @@ impl Diagnosis {
             Self::NoiseModel => "noise-model",
             Self::Cancelled => "cancelled",
             Self::DecodeFailed => "decode-failed",
+            Self::Interrupted => "interrupted",
         }
     }
 

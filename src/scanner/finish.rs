@@ -1,0 +1,128 @@
+//! The thread that finishes captures: decodes and writes them, one after the other, on a pool of threads of its own, so
+//! that the interface answers while all cores compute.
+
+use std::{
+    panic::{AssertUnwindSafe, catch_unwind},
+    path::PathBuf,
+    sync::mpsc::{Receiver, Sender},
+};
+
+use polscan_patterns::Mode;
+
+use super::{
+    owner::Message,
+    rig::{Captured, said},
+};
+use crate::{
+    engine::{self, DecodeRequest, Failure, Label},
+    report::Report,
+};
+
+/// How much the computing threads stand back behind all others.
+const NICE: i32 = 5;
+
+/// What is to be finished.
+#[derive(Debug)]
+pub enum Work {
+    /// A capture.
+    Capture(Box<Captured>),
+    /// Frames that were recorded before.
+    Recorded {
+        /// How the result is called.
+        label: Label,
+        /// Bundle with the frames.
+        source: PathBuf,
+        /// Mode, where it is not that of the bundle.
+        mode: Option<Mode>,
+        /// Where the result goes.
+        bundle: PathBuf,
+    },
+}
+
+/// What the thread tells.
+#[derive(Debug)]
+pub enum News {
+    /// It has begun with a scan.
+    Begun {
+        /// Scan.
+        id: String,
+    },
+    /// A scan is finished.
+    Finished {
+        /// Scan.
+        id: String,
+        /// What came of it.
+        result: Result<Box<Report>, Broken>,
+    },
+}
+
+/// Why there is no result.
+#[derive(Debug)]
+pub struct Broken {
+    /// Stable slug.
+    pub kind: &'static str,
+    /// What went wrong.
+    pub message: String,
+}
+
+impl From<Failure> for Broken {
+    fn from(failure: Failure) -> Self {
+        Self { kind: failure.kind().slug(), message: failure.chain() }
+    }
+}
+
+/// The threads that compute.
+pub fn pool() -> Result<rayon::ThreadPool, rayon::ThreadPoolBuildError> {
+    rayon::ThreadPoolBuilder::new()
+        .thread_name(|number| format!("compute-{number}"))
+        .start_handler(|_| {
+            // On Linux this is about the calling thread alone.
+            if let Err(error) = rustix::process::nice(NICE) {
+                tracing::debug!(%error, "computing threads run at the priority of all others");
+            }
+        })
+        .build()
+}
+
+/// Runs until all senders of `work` are gone.
+pub fn run(pool: &rayon::ThreadPool, news: &Sender<Message>, work: &Receiver<Work>) {
+    let tell = |said| drop(news.send(Message::Finish(said)));
+    for work in work {
+        let id = match &work {
+            Work::Capture(captured) => captured.label.id.clone(),
+            Work::Recorded { label, .. } => label.id.clone(),
+        };
+        tell(News::Begun { id: id.clone() });
+        let span = tracing::info_span!("scan", id);
+        let _inside = span.enter();
+        let done = catch_unwind(AssertUnwindSafe(|| pool.install(|| span.in_scope(|| finish(work)))));
+        let result = match done {
+            Ok(result) => result.map(Box::new).map_err(Broken::from),
+            Err(panic) => {
+                let message = format!("a defect of this program: {}", said(&*panic));
+                Err(Broken { kind: "internal", message })
+            }
+        };
+        tell(News::Finished { id, result });
+    }
+}
+
+fn finish(work: Work) -> Result<Report, Failure> {
+    match work {
+        Work::Capture(captured) => {
+            let Captured { scan, taken, writer, label } = *captured;
+            scan.finish(&taken, label, writer)
+        }
+        Work::Recorded { label, source, mode, bundle } => {
+            let recorded = DecodeRequest {
+                bundle: &source,
+                calibration: None,
+                projector_left: false,
+                calibration_unit_mm: 1.0,
+                mode,
+                regions: &[],
+            };
+            engine::decode(&recorded, label, &bundle)
+        }
+    }
+}

@@ -1,0 +1,148 @@
+//! What rig and finisher tell.
+
+use super::*;
+
+impl Owner {
+    pub(super) fn rig_news(&mut self, news: rig::News) {
+        match news {
+            rig::News::Open { camera, projector, scan_bytes } => {
+                self.rig = RigStatus {
+                    state: RigState::Ready,
+                    camera: Some(*camera),
+                    projector: Some(*projector),
+                    ..RigStatus::default()
+                };
+                self.storage.scan_bytes = scan_bytes;
+                self.look_at_storage();
+                self.rig_event();
+            }
+            rig::News::Down { message } => self.rig_down(message),
+            rig::News::Started { id, frames } => {
+                self.edit(&id, |record| record.progress.of = frames);
+                self.progress(&id);
+            }
+            rig::News::Frame { id, done } => {
+                self.edit(&id, |record| record.progress.frames = done);
+                self.progress(&id);
+            }
+            rig::News::Retaking { id } => {
+                self.edit(&id, |record| record.progress.retaken += 1);
+                self.progress(&id);
+            }
+            rig::News::Taken(captured) => self.taken(captured),
+            rig::News::Refused { id, failure } => {
+                self.release();
+                let kind = failure.kind().slug();
+                self.end(&id, State::Failed, |record| record.blame(kind, failure.chain()));
+            }
+            rig::News::Panicked { id, message } => {
+                self.release();
+                let message = format!("a defect of this program: {message}");
+                self.end(&id, State::Failed, |record| record.blame("internal", message));
+            }
+            rig::News::Previewed => self.previewing = false,
+        }
+    }
+
+    pub(super) fn rig_down(&mut self, message: String) {
+        tracing::warn!(message, "the rig cannot scan");
+        self.rig.state = RigState::Fault;
+        self.rig.message = Some(message.clone());
+        self.rig.showing = None;
+        self.rig_event();
+        // Whoever did not want to wait learns it now; the others wait for somebody to release them.
+        let urgent: Vec<String> =
+            self.queue.iter().filter(|one| one.urgent && !one.held).map(|one| one.id.clone()).collect();
+        self.queue.retain(|waiting| !urgent.contains(&waiting.id));
+        for id in &urgent {
+            self.end(id, State::Failed, |record| record.blame("unavailable", message.clone()));
+        }
+        self.hold(true);
+    }
+
+    pub(super) fn taken(&mut self, captured: Box<Captured>) {
+        self.release();
+        let id = captured.label.id.clone();
+        let failure = captured.taken.failure().cloned();
+        if let Some(reason) = &failure
+            && captured.taken.record().frames.is_empty()
+        {
+            let (state, kind) = self.end_of(reason.diagnosis);
+            let message = reason.message.clone();
+            self.end(&id, state, |record| record.blame(kind, message));
+            return;
+        }
+        match failure {
+            None => self.advance(&id, State::Acquired),
+            Some(reason) => drop(self.cut_short.insert(id.clone(), reason.diagnosis)),
+        }
+        self.finishing.push_back(id);
+        let _ = self.out.finish.send(Work::Capture(captured));
+    }
+
+    /// State and slug of a capture that did not come to its end.
+    pub(super) fn end_of(&self, diagnosis: Diagnosis) -> (State, &'static str) {
+        match diagnosis {
+            Diagnosis::Cancelled if self.stop_by.is_some_and(|limit| Instant::now() >= limit) => {
+                (State::Interrupted, Diagnosis::Interrupted.slug())
+            }
+            Diagnosis::Cancelled => (State::Cancelled, Diagnosis::Cancelled.slug()),
+            other => (State::Failed, other.slug()),
+        }
+    }
+
+    pub(super) fn finish_news(&mut self, news: finish::News) {
+        match news {
+            finish::News::Begun { id } => {
+                // What was cut short is only written down.
+                let state = self.scans.get(&id).map(|record| record.state);
+                if matches!(state, Some(State::Acquired | State::Queued)) {
+                    self.advance(&id, State::Decoding);
+                }
+            }
+            finish::News::Finished { id, result } => self.finished(&id, result),
+        }
+    }
+
+    pub(super) fn finished(&mut self, id: &str, result: Result<Box<Report>, Broken>) {
+        self.finishing.retain(|other| other != id);
+        let cancelled = self.cancel.get(id).is_some_and(CancelFlag::is_cancelled);
+        let cut_short = self.cut_short.remove(id);
+        match result {
+            // The frames were complete and somebody asked to stop all the same: nobody wants the result.
+            Ok(_) if cancelled && cut_short.is_none() => {
+                match self.library.discard(id) {
+                    Ok(left) => {
+                        left.into_iter().for_each(|left| drop(self.out.disk.send(disk::Task::Remove(left))))
+                    }
+                    Err(error) => {
+                        tracing::warn!(id, error = chain(&error), "a cancelled scan still takes space")
+                    }
+                }
+                self.end(id, State::Cancelled, |record| record.blame("cancelled", "the scan was cancelled"));
+            }
+            Ok(report) => {
+                let state = match cut_short {
+                    Some(diagnosis) => self.end_of(diagnosis).0,
+                    None if report.verdict == Verdict::Failed => State::Failed,
+                    None => State::Done,
+                };
+                let bytes = self.library.bundle_bytes(id);
+                self.end(id, state, |record| {
+                    record.adopt(&report);
+                    record.bytes = bytes;
+                });
+            }
+            Err(broken) => self.end(id, State::Failed, |record| record.blame(broken.kind, broken.message)),
+        }
+        self.look_at_storage();
+    }
+
+    /// The rig is free again.
+    pub(super) fn release(&mut self) {
+        self.active = None;
+        if self.rig.state == RigState::Busy {
+            self.rig.state = RigState::Ready;
+        }
+    }
+}

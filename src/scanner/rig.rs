@@ -1,0 +1,404 @@
+//! The thread that owns the rig: opens it, and opens it again after a failure; captures scans; holds pictures; takes
+//! single frames for the preview. Nothing else ever touches a device.
+
+use std::{
+    panic::{AssertUnwindSafe, catch_unwind},
+    path::PathBuf,
+    sync::{
+        Arc,
+        mpsc::{Receiver, RecvTimeoutError, Sender},
+    },
+    time::{Duration, Instant},
+};
+
+use polscan_drivers::{camera::CameraInfo, error::DeviceError, projector::ProjectorInfo};
+use polscan_patterns::{Mode, Picture, ProjectorSize, Role, Sequence};
+use tokio::sync::oneshot;
+
+use super::{
+    disk, heartbeat::Heartbeat, metrics::Metrics, owner::Message, prepared::Prepared, preview::Preview,
+};
+use crate::{
+    app::Rig,
+    config::Settings,
+    engine::{Failure, Label, Scan, Taken, rig_failure},
+    report::Diagnosis,
+    sequencer::{CancelFlag, Progress, slide},
+    store::BundleWriter,
+};
+
+/// Pauses before the rig is opened again.
+const BACKOFF: [Duration; 5] = [
+    Duration::from_millis(500),
+    Duration::from_secs(1),
+    Duration::from_secs(2),
+    Duration::from_secs(5),
+    Duration::from_secs(10),
+];
+
+/// Longest time between two signs of life of an idle rig.
+const TICK: Duration = Duration::from_millis(500);
+
+/// How long a frame for the preview is waited for, beyond its exposure.
+const PREVIEW_SLACK: Duration = Duration::from_millis(500);
+
+/// A picture to hold for set-up.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Shown {
+    /// One of the pictures made for it.
+    Picture(Picture),
+    /// A pattern of a sequence.
+    Pattern(Role),
+}
+
+impl std::str::FromStr for Shown {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        match (text.parse(), text.parse()) {
+            (Ok(picture), _) => Ok(Self::Picture(picture)),
+            (_, Ok(role)) => Ok(Self::Pattern(role)),
+            (Err(error), _) => Err(format!("{error}, nor a pattern such as column-0 or column-0-inverse")),
+        }
+    }
+}
+
+/// A scan to capture.
+#[derive(Debug)]
+pub struct Job {
+    /// How it is called.
+    pub label: Label,
+    /// Mode.
+    pub mode: Mode,
+    /// Exposure, where it is not the configured one.
+    pub exposure_us: Option<f64>,
+    /// Asks it to stop.
+    pub cancel: CancelFlag,
+    /// Where its bundle will be.
+    pub bundle: PathBuf,
+    /// Where its frames are spooled.
+    pub spool: PathBuf,
+}
+
+/// What the rig is asked to do.
+#[derive(Debug)]
+pub enum Command {
+    /// Capture a scan.
+    Scan(Box<Job>),
+    /// Hold a picture.
+    Show(Shown, oneshot::Sender<Result<(), Failure>>),
+    /// Take a frame for the preview.
+    Preview,
+}
+
+/// A capture that is to be finished.
+#[derive(Debug)]
+pub struct Captured {
+    /// What was to be captured.
+    pub scan: Arc<Scan>,
+    /// What was.
+    pub taken: Taken,
+    /// Where the result goes.
+    pub writer: BundleWriter,
+    /// How it is called.
+    pub label: Label,
+}
+
+/// What the rig tells.
+#[derive(Debug)]
+pub enum News {
+    /// It is open.
+    Open {
+        /// Camera.
+        camera: Box<CameraInfo>,
+        /// Projector.
+        projector: Box<ProjectorInfo>,
+        /// Bytes that a scan may need on the disk, spool and result.
+        scan_bytes: u64,
+    },
+    /// It cannot be opened, or failed; it will be tried again.
+    Down {
+        /// Why and what to do.
+        message: String,
+    },
+    /// The first pattern is due.
+    Started {
+        /// Scan.
+        id: String,
+        /// Frames of the sequence.
+        frames: usize,
+    },
+    /// A frame has come.
+    Frame {
+        /// Scan.
+        id: String,
+        /// Frames in hand.
+        done: usize,
+    },
+    /// Frames are taken again.
+    Retaking {
+        /// Scan.
+        id: String,
+    },
+    /// The capture is over and the projector black.
+    Taken(Box<Captured>),
+    /// The scan could not begin.
+    Refused {
+        /// Scan.
+        id: String,
+        /// Why.
+        failure: Failure,
+    },
+    /// The capture ended in a panic, a defect of this program.
+    Panicked {
+        /// Scan.
+        id: String,
+        /// What the panic said.
+        message: String,
+    },
+    /// The frame for the preview has been taken, or not.
+    Previewed,
+}
+
+/// Everything that the thread shares with others.
+pub struct Shared {
+    /// Settings of the daemon.
+    pub settings: Settings,
+    /// Where news go.
+    pub news: Sender<Message>,
+    /// Where frames are spooled.
+    pub disk: Sender<disk::Task>,
+    /// Where the latest frame goes.
+    pub preview: Arc<Preview>,
+    /// Metrics.
+    pub metrics: Arc<Metrics>,
+    /// When the thread last gave a sign of life.
+    pub heartbeat: Arc<Heartbeat>,
+}
+
+/// An open rig and the scan that its camera is set for.
+struct Open {
+    rig: Rig,
+    prepared: Prepared,
+}
+
+/// Runs until all senders of `commands` are gone.
+pub fn run(shared: &Shared, commands: &Receiver<Command>) {
+    let mut open: Option<Open> = None;
+    let mut failures = 0usize;
+    let mut next_try = Instant::now();
+    loop {
+        shared.heartbeat.beat();
+        if open.is_none() && Instant::now() >= next_try {
+            match guarded(|| Open::new(shared)) {
+                Ok(opened) => {
+                    shared.tell(opened.news());
+                    shared.up(true);
+                    open = Some(opened);
+                    failures = 0;
+                }
+                Err(message) => {
+                    shared.tell(News::Down { message });
+                    next_try = Instant::now() + BACKOFF[failures.min(BACKOFF.len() - 1)];
+                    failures += 1;
+                }
+            }
+            shared.heartbeat.beat();
+        }
+        let wait =
+            if open.is_none() { next_try.saturating_duration_since(Instant::now()).min(TICK) } else { TICK };
+        let command = match commands.recv_timeout(wait) {
+            Ok(command) => command,
+            Err(RecvTimeoutError::Timeout) => continue,
+            Err(RecvTimeoutError::Disconnected) => break,
+        };
+        let broken = match (command, &mut open) {
+            (Command::Scan(job), Some(rig)) => rig.scan(shared, *job),
+            (Command::Show(shown, reply), Some(rig)) => {
+                let _ = reply.send(rig.show(shared, shown));
+                None
+            }
+            (Command::Preview, Some(rig)) => {
+                let broken = rig.preview(shared).err().map(|error| error.to_string());
+                shared.tell(News::Previewed);
+                broken
+            }
+            (command, None) => {
+                refuse(shared, command);
+                None
+            }
+        };
+        if let Some(message) = broken {
+            tracing::warn!(message, "the rig is opened again");
+            // Closed first: a device cannot be opened twice.
+            open = None;
+            shared.up(false);
+            shared.metrics.camera_reconnects.inc();
+            shared.tell(News::Down { message });
+            next_try = Instant::now() + BACKOFF[0];
+        }
+    }
+}
+
+/// Runs `open`, with a panic of a driver as an error like any other.
+fn guarded(open: impl FnOnce() -> Result<Open, Failure>) -> Result<Open, String> {
+    match catch_unwind(AssertUnwindSafe(open)) {
+        Ok(Ok(opened)) => Ok(opened),
+        Ok(Err(failure)) => Err(failure.chain()),
+        Err(panic) => Err(format!("opening the rig ended in a defect of this program: {}", said(&*panic))),
+    }
+}
+
+/// What a panic said.
+pub fn said(panic: &(dyn std::any::Any + Send)) -> String {
+    let text = panic.downcast_ref::<&str>().map(|text| (*text).to_owned());
+    text.or_else(|| panic.downcast_ref::<String>().cloned()).unwrap_or_else(|| "no message".to_owned())
+}
+
+fn refuse(shared: &Shared, command: Command) {
+    let message = "the rig is not open; see /readyz for the reason".to_owned();
+    let failure = Failure::NoDevice { operation: "use the rig", message };
+    match command {
+        Command::Scan(job) => shared.tell(News::Refused { id: job.label.id, failure }),
+        Command::Show(_, reply) => drop(reply.send(Err(failure))),
+        Command::Preview => shared.tell(News::Previewed),
+    }
+}
+
+impl Shared {
+    fn tell(&self, news: News) {
+        // Whoever does not listen any more is ending the process.
+        let _ = self.news.send(Message::Rig(news));
+    }
+
+    fn up(&self, up: bool) {
+        self.metrics.camera_up.set(i64::from(up));
+        self.metrics.projector_up.set(i64::from(up));
+    }
+}
+
+impl Open {
+    fn new(shared: &Shared) -> Result<Self, Failure> {
+        let mut rig = Rig::open(&shared.settings).map_err(rig_failure)?;
+        let prepared = Prepared::new(&shared.settings, shared.settings.mode, None, &mut rig)?;
+        Ok(Self { rig, prepared })
+    }
+
+    fn news(&self) -> News {
+        News::Open {
+            camera: Box::new(self.rig.camera.info().clone()),
+            projector: Box::new(self.rig.projector.info().clone()),
+            scan_bytes: self.prepared.scan.bytes() + self.prepared.scan.frame_bytes(),
+        }
+    }
+
+    /// Captures a scan; says what is broken afterwards, if anything is.
+    fn scan(&mut self, shared: &Shared, job: Job) -> Option<String> {
+        let id = job.label.id.clone();
+        let span = tracing::info_span!("scan", id);
+        let _inside = span.enter();
+        let outcome = catch_unwind(AssertUnwindSafe(|| self.capture(shared, job)));
+        let (news, broken) = match outcome {
+            Ok(Ok(captured)) => {
+                let failure = captured.taken.failure();
+                let broken = failure.filter(|reason| reason.diagnosis == Diagnosis::DeviceFault);
+                let broken = broken.map(|reason| reason.message.clone());
+                (News::Taken(Box::new(captured)), broken)
+            }
+            Ok(Err(failure)) => {
+                // A device that refuses a setting is well.
+                let refused = |source: &DeviceError| matches!(source, DeviceError::Refused { .. });
+                let broken = match &failure {
+                    Failure::Device { source, .. } if !refused(source) => Some(failure.chain()),
+                    _ => None,
+                };
+                (News::Refused { id, failure }, broken)
+            }
+            Err(panic) => {
+                let message = said(&*panic);
+                (News::Panicked { id, message: message.clone() }, Some(message))
+            }
+        };
+        shared.tell(news);
+        broken
+    }
+
+    fn capture(&mut self, shared: &Shared, job: Job) -> Result<Captured, Failure> {
+        self.prepared.renew(&shared.settings, job.mode, job.exposure_us, &mut self.rig)?;
+        let scan = self.prepared.scan.clone();
+        let needed = scan.bytes() + scan.frame_bytes();
+        let writer = BundleWriter::create(&job.bundle, None, needed)
+            .map_err(|error| Failure::storage("write the result", error))?;
+        let (manifest, calibration) = scan.preface(job.label.clone())?;
+        let id = job.label.id.clone();
+        let spool = |task| drop(shared.disk.send(task));
+        spool(disk::Task::Begin { id: id.clone(), folder: job.spool, manifest, calibration });
+        let camera = self.rig.camera.info().serial.clone();
+        let period = self.rig.projector.info().refresh_period.as_secs_f64();
+        let mut first_flip = None;
+        let mut progress = |progress: Progress<'_>| {
+            shared.heartbeat.beat();
+            match progress {
+                Progress::Started { frames, .. } => shared.tell(News::Started { id: id.clone(), frames }),
+                Progress::Captured { done, frame, .. } => {
+                    spool(disk::Task::Frame { id: id.clone(), frame: Box::new(frame.clone()) });
+                    shared.preview.offer(&frame.frame, &self.prepared.applied);
+                    let latency = frame.frame.stamp.received.since(frame.triggered);
+                    shared.metrics.trigger_to_frame.observe(latency.as_secs_f64());
+                    let first = *first_flip.get_or_insert(frame.receipt.flipped);
+                    let refreshes = frame.receipt.flipped.since(first).as_secs_f64() / period;
+                    shared.metrics.present_phase_error.set((refreshes - refreshes.round()) * period);
+                    shared.metrics.frames(&camera, "ok", 1);
+                    shared.tell(News::Frame { id: id.clone(), done });
+                }
+                Progress::Accepted(_) => {}
+                Progress::Retaking { roles, .. } => {
+                    shared.metrics.frames(&camera, "retaken", roles.len() as u64);
+                    shared.tell(News::Retaking { id: id.clone() });
+                }
+            }
+        };
+        let taken = scan.capture(&mut self.rig, &mut progress, &job.cancel);
+        Ok(Captured { scan, taken, writer, label: job.label })
+    }
+
+    fn show(&mut self, shared: &Shared, shown: Shown) -> Result<(), Failure> {
+        let device = |source| Failure::Device { operation: "hold a picture", source };
+        let info = self.rig.projector.info();
+        let size = ProjectorSize { width: info.width, height: info.height };
+        let polarization = shared.settings.polarization;
+        let raster = match shown {
+            Shown::Picture(Picture::Black) => return self.rig.projector.black().map(|_| ()).map_err(device),
+            Shown::Picture(picture) => picture.raster(size, polarization),
+            Shown::Pattern(role) => {
+                let modes = [shared.settings.mode, Mode::Pse, Mode::Gray];
+                let sequences = modes.into_iter().map(|mode| Sequence::new(mode, size));
+                let able = sequences.filter_map(Result::ok).find(|sequence| sequence.can_show(role));
+                let sequence = able.ok_or_else(|| {
+                    Failure::data(
+                        "hold a picture",
+                        format!("no mode shows {role} on a projector of this size"),
+                    )
+                })?;
+                sequence.raster(role, polarization)
+            }
+        };
+        self.rig.projector.load(&[slide(raster)]).map_err(device)?;
+        self.rig.projector.show(0).map(|_| ()).map_err(device)
+    }
+
+    fn preview(&mut self, shared: &Shared) -> Result<(), DeviceError> {
+        let Rig { camera, clock, .. } = &mut self.rig;
+        camera.arm(1)?;
+        let exposure = Duration::from_secs_f64(1e-6 * self.prepared.applied.settings.exposure_us);
+        let taken = camera.trigger(clock.now()).and_then(|_| camera.next_frame(exposure + PREVIEW_SLACK));
+        let disarmed = camera.disarm();
+        match taken {
+            Ok(frame) => shared.preview.offer(&frame, &self.prepared.applied),
+            // One frame more or less does not matter here.
+            Err(DeviceError::Timeout { .. }) => {}
+            Err(error) => return Err(error),
+        }
+        disarmed.map(|_| ())
+    }
+}

@@ -1,0 +1,13 @@
+//! The service from outside: a real process on a small twin, spoken to over its socket.
+
+mod client;
+mod daemon;
+mod lifecycle;
+mod recovery;
+mod refusals;
+#[path = "../end_to_end/rig.rs"]
+#[allow(dead_code)] // The other suite needs more of it.
+mod rig;
+mod scans;
+mod storage;
+mod streams;
