@@ -20,8 +20,9 @@ const NEAR_EDGE: usize = 6;
 const EDGE_STEP: usize = 2;
 /// How many sigma apart P and Q must be to tell the bright frame.
 const BRIGHT_SIGMA: f64 = 8.0;
-/// A larger change of one frame's brightness is another picture.
-const LARGEST_CHANGE: f64 = 0.5;
+/// A larger change of one frame's brightness is another picture. As a share of the frame, so that half the light is -1 and
+/// twice the light 1/2.
+const LARGEST_CHANGE: [f64; 2] = [-1.0, 0.5];
 /// Spread up to which what a change of brightness leaves is noise: 1 by its definition, more where noise is estimated.
 const EXPLAINED_SIGMA: f64 = 1.5;
 /// Where the modulation is less than this many sigma, another picture might not show.
@@ -100,14 +101,18 @@ pub struct Look {
 impl Look {
     /// Share of the pixels that a change of brightness, if it is no absurd one, does not explain.
     pub fn disturbed(&self) -> f64 {
-        if self.change.abs() < LARGEST_CHANGE { self.unexplained } else { self.outliers }
+        if self.is_sensible() { self.unexplained } else { self.outliers }
     }
 
     /// Whether the frames differ in brightness from the others, and by nothing else.
     pub fn is_brightness(&self) -> bool {
         self.unexplained <= 0.1 * self.outliers
             && self.spread <= EXPLAINED_SIGMA * self.noise.max(1.0)
-            && self.change.abs() < LARGEST_CHANGE
+            && self.is_sensible()
+    }
+
+    fn is_sensible(&self) -> bool {
+        (LARGEST_CHANGE[0]..LARGEST_CHANGE[1]).contains(&self.change)
     }
 
     /// How far the outliers of this pair and of `other` are the same pixels: 1 where all are, 0 where as many are as

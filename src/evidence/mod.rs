@@ -25,6 +25,8 @@ pub const STALE_SHARE: f64 = 0.5;
 const ANOTHER_REFERENCE: f64 = 0.35;
 /// Range of the same within which it is the modulation itself.
 const ANOTHER: [f64; 2] = [0.75, 1.3];
+/// Strength that no rest has, the references being too dark for the frames.
+const ABSURD: f64 = 2.5;
 /// Share of the outliers with one sign from which on they are one-sided.
 const ONE_SIDED: f64 = 0.9;
 /// Outliers of a pair from which on a whole frame is wrong. A frame that shows another pattern is wrong on a half of
@@ -132,8 +134,10 @@ impl Look {
         }
         let strength = self.strength.unwrap_or(1.0);
         let spread = self.strength_spread.unwrap_or(0.0);
+        // Where the references carry a rest, too, it comes once or twice, and always brightens.
+        let rests = self.one_sided >= ONE_SIDED && spread > ONE_REST && strength < ABSURD;
         // Another picture is off by the whole modulation; by more where the references are other pictures, too.
-        let is_another = strength > ANOTHER[1] || (strength >= ANOTHER[0] && spread <= ONE_REST);
+        let is_another = !rests && (strength > ANOTHER[1] || (strength >= ANOTHER[0] && spread <= ONE_REST));
         if let Some(row) = self.torn_at.filter(|_| is_another) {
             return Cause::Torn(row);
         }
@@ -142,8 +146,7 @@ impl Look {
         }
         match is_another {
             true => Cause::OtherPicture,
-            // Where the references carry a rest, too, it comes once or twice, and always brightens.
-            false if spread <= ONE_REST || self.one_sided >= ONE_SIDED => Cause::Rest(strength),
+            false if rests || spread <= ONE_REST => Cause::Rest(strength),
             false => Cause::Local,
         }
     }

@@ -78,15 +78,19 @@ fn from_pixels(input: &ReportInput, decoded: &Decoded, pixels: &PixelCounts) -> 
     let look = input.settings.filter(|_| !input.planes.is_empty());
     let mut look =
         look.map(|settings| Frames { all: input.planes, settings, decoded, last_references: true });
-    let mut reasons: Vec<Reason> = look.and_then(references::disagree).into_iter().collect();
-    if let (Some(frames), false) = (&mut look, reasons.is_empty()) {
+    let disagree = look.and_then(references::disagree);
+    if let (Some(frames), true) = (&mut look, disagree.is_some()) {
         frames.last_references = false;
     }
-    reasons.extend(pairs::diagnose(decoded, look));
-    if !reasons.is_empty() && look.is_some_and(|frames| !frames.last_references) {
+    let mut reasons = pairs::diagnose(decoded, look);
+    if let Some(disagree) = disagree {
         // A drift between references that show different pictures is none.
         reasons
             .retain(|reason| !matches!(reason.diagnosis, Diagnosis::ExposureDrift | Diagnosis::AmbientDrift));
+        // Behind a lost frame the references are out of place as well.
+        if !reasons.iter().any(|reason| reason.diagnosis == Diagnosis::LostFrame) {
+            reasons.push(disagree);
+        }
     }
     let names = [
         Diagnosis::StaleFrame,
@@ -102,8 +106,8 @@ fn from_pixels(input: &ReportInput, decoded: &Decoded, pixels: &PixelCounts) -> 
     if !wrong || !reasons.iter().any(|reason| reason.diagnosis == Diagnosis::PolarizationInverted) {
         reasons.extend(wrong_order(input, decoded, pixels, !wrong));
     }
-    reasons.extend(polarization(input, decoded, pixels));
     reasons.extend(saturated(decoded, pixels));
+    reasons.extend(polarization(input, decoded, pixels));
     reasons.extend(input.reconstruction.and_then(|made| made.row_check).and_then(row_mismatch));
     // Beside saturated pixels others fail, too, without being dead.
     let glares = reasons.iter().any(|reason| reason.diagnosis == Diagnosis::Saturated);
@@ -115,6 +119,7 @@ fn from_pixels(input: &ReportInput, decoded: &Decoded, pixels: &PixelCounts) -> 
         let follows = [
             Diagnosis::Flicker,
             Diagnosis::UnsettledDisplay,
+            Diagnosis::NonlinearResponse,
             Diagnosis::PolarizationWeak,
             Diagnosis::SensorDefect,
             Diagnosis::LowCoverage,
@@ -366,7 +371,8 @@ pub fn degree_of_polarization(decoded: &Decoded) -> Option<f64> {
     let (mut sum, mut weight) = (0.0, 0.0);
     for (index, class) in decoded.class.data().iter().enumerate() {
         let degree = f64::from(decoded.dolp.data()[index]);
-        if !class.is_lit() || matches!(class, Class::Inverted | Class::Saturated) || !degree.is_finite() {
+        let clipped = *class == Class::Saturated || decoded.half_saturated.data()[index];
+        if !class.is_lit() || clipped || *class == Class::Inverted || !degree.is_finite() {
             continue;
         }
         let brightness = f64::from(decoded.intensity.data()[index]);

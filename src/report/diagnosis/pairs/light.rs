@@ -36,9 +36,11 @@ fn is_automatic(frames: Frames, coarse: &[View], shifted: &[Case]) -> bool {
     let mut steps: Vec<[f64; 3]> = Vec::new();
     for two in gains.windows(2) {
         let ((place, before), (next, after)) = (two[0], two[1]);
-        if next == place + 1 && before > -0.95 && after > -0.95 {
+        if next == place + 1 && before < 0.95 && after < 0.95 {
+            // Gains are shares of the frame itself.
+            let [before, after] = [before, after].map(|gain| -(-gain).ln_1p());
             let mean = mean(place).ln();
-            steps.push([mean, mean - before.ln_1p(), after.ln_1p() - before.ln_1p()]);
+            steps.push([mean, mean - before, after - before]);
         }
     }
     if steps.len() < LEAST_STEPS {
