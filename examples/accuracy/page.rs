@@ -78,7 +78,13 @@ const COLUMNS: &str = "depth error, mm | plane RMSE, mm | column error, px | cov
 fn aims(page: &mut String, measured: &Measured) -> Result<(), Box<dyn Error>> {
     page.push_str("## Aims\n\n| quantity | aim | measured | reached |\n|---|---|---|---|\n");
     let mut row = |what: &str, aim: &str, value: Option<f64>, decimals: usize, reached: bool| {
-        let reached = if reached { "yes" } else { "**no**" };
+        let reached = if aim == "none" {
+            "–"
+        } else if reached {
+            "yes"
+        } else {
+            "**no**"
+        };
         writeln!(page, "| {what} | {aim} | {} | {reached} |", number(value, decimals))
     };
     for (name, limit) in [("white", 0.5), ("black", 0.7)] {
@@ -108,7 +114,7 @@ fn aims(page: &mut String, measured: &Measured) -> Result<(), Box<dyn Error>> {
     for (mode, strips) in &measured.wedges {
         let what = format!("range of reflectance at extinction 10:1, 12 bit, mode {mode}, decades");
         let found = decades(strips);
-        let (aim, reached) = if mode.name() == "pse" { (">= 3.1", found >= 3.1) } else { ("(none)", true) };
+        let (aim, reached) = if mode.name() == "pse" { (">= 3.1", found >= 3.1) } else { ("none", true) };
         row(&what, aim, Some(found), 2, reached)?;
     }
     for (reflectance, rms) in &measured.edges {
@@ -148,15 +154,16 @@ fn shortfalls(page: &mut String, measured: &Measured) -> Result<(), Box<dyn Erro
          decides pixel by pixel:\n  with a full well of 10 500 electrons the modulation `(1 - 1/e) H` sinks to 4 sigma of a \
          pattern less its inverse, `sqrt((1 + 1/e) H + 2 ambient + 2 read^2)`,\n  {with:.2} decades below the brightest \
          strip ({without:.2} without any ambient light), and at 3.1 decades it would be below 1 sigma: one bit in five wrong.\n  \
-         What is missing to that limit is the blur, which takes a third of the finest stripes' modulation."
+         That limit of the gate is arithmetic; that blur of the finest stripes costs the rest of \
+         the way is likely, and not measured."
     )?;
     match weakest {
         Some((reflectance, accuracy)) => writeln!(
             page,
             "- **Sigma in the dark**: where light is scarce the stated sigma is too small: by a factor of {} at a reflectance \
-             of {reflectance:.4}, where\n  coverage is still {}. The position of an edge between two pixels is a ratio of \
-             noisy numbers, and its variance is stated to first order; where the\n  noise of the slope is no longer small \
-             against the slope, that falls short. In mode paper, whose edges are means over three lines, it does not show.\n",
+             of {reflectance:.4}, where\n  coverage is still {}. The likely cause is not proven: the variance of an \
+             edge's position, a ratio of noisy numbers, is stated\n  to first order in the noise. In mode paper, whose edges \
+             are measured over three lines, sigma errs to the other side on bright strips.\n\n",
             number(accuracy.sigma_z_ratio, 2),
             percent(accuracy.coverage)
         )?,

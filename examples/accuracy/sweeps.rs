@@ -165,8 +165,8 @@ pub fn all(base: &Settings) -> Result<Measured, Box<dyn Error>> {
                 "Exposure",
                 "exposure, us",
                 true,
-                "At 4000 us the white plate's H reference saturates, its edges can no longer be placed, and points fall \
-                 back to whole codes with a sigma that says so; at 8000 us nearly all its pairs saturate.",
+                "At 4000 us the white plate saturates in its H reference: nearly all its pixels stay, but with errors of whole \
+                 codes and a sigma that is too small. At 8000 us its pairs saturate and it is given up.",
             ),
             &[125.0, 250.0, 500.0, 1000.0, 2000.0, 4000.0, 8000.0],
             |settings, value| {
@@ -219,8 +219,8 @@ pub fn all(base: &Settings) -> Result<Measured, Box<dyn Error>> {
                 "blur of the projector lens, projector px (standard deviation)",
                 false,
                 "One projector pixel is three camera pixels wide here; the camera's own blur stays at 0.6 px. Below 0.2 px \
-                 the twin is at its limit, not the decoder: it samples the projected picture at the middle of each camera \
-                 pixel, so that a perfectly sharp stripe edge is only known to a camera pixel, and no sigma can tell.",
+                 sigma is far too small on this twin, which samples the projected picture at the middle of each camera \
+                 pixel: a perfectly sharp stripe edge is then known to a pixel only, which the decoder does not expect.",
             ),
             &[0.0, 0.1, 0.2, 0.4, 0.6, 0.9, 1.2],
             |settings, value| {

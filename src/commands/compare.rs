@@ -38,7 +38,8 @@ pub enum CompareArgs {
 pub fn compare(args: &CompareArgs, regions: &[NamedRegion], out: &Path, json: bool) -> Result<u8, Failure> {
     let failed = |error: StorageError| Failure::storage("write the comparison", error);
     if let CompareArgs::Bundles(bundles) = args {
-        for (_, path) in bundles {
+        // What is not there is refused when it is read.
+        for (_, path) in bundles.iter().filter(|(_, path)| path.exists()) {
             refuse_inside(path, out)?;
         }
     }
@@ -89,7 +90,7 @@ fn refuse_inside(bundle: &Path, out: &Path) -> Result<(), Failure> {
 
 /// What came of it.
 enum Made {
-    Compared(Comparison),
+    Compared(Box<Comparison>),
     Failed { method: Method, reason: String },
 }
 
@@ -149,9 +150,9 @@ fn twin(settings: &Settings, name: &str, regions: &[NamedRegion]) -> Result<Made
     )))
 }
 
-fn compared(scene: String, places: Option<Places>, entries: Vec<Entry>) -> Comparison {
+fn compared(scene: String, places: Option<Places>, entries: Vec<Entry>) -> Box<Comparison> {
     let places = places.unwrap_or_else(|| Places::new((0, 0), None, &[]));
-    Comparison::new(scene, places, entries)
+    Box::new(Comparison::new(scene, places, entries))
 }
 
 /// What is shown of one outcome. The first one chooses the places.

@@ -54,8 +54,11 @@ fn table(body: &mut Markup, head: &[&str], rows: &[Vec<String>]) {
     });
 }
 
+/// Title of a row, and its cell for a method.
+type Row<'a> = (String, &'a dyn Fn(&Figures) -> String);
+
 /// A table with one column per method.
-fn by_method(body: &mut Markup, comparison: &Comparison, rows: &[(String, &dyn Fn(&Figures) -> String)]) {
+fn by_method(body: &mut Markup, comparison: &Comparison, rows: &[Row<'_>]) {
     body.element("div", &[("class", "wide")], |div| {
         div.element("table", &[], |table| {
             table.element("thead", &[], |thead| {
@@ -92,8 +95,7 @@ pub fn summary(body: &mut Markup, comparison: &Comparison) {
     let sigma = |f: &Figures| number(interior(f).and_then(|t| t.sigma_z_ratio), 2);
     let frames = |f: &Figures| f.report.frames.to_string();
     let seconds = |f: &Figures| number(f.report.capture.seconds, 2);
-    let mut rows: Vec<(String, &dyn Fn(&Figures) -> String)> =
-        vec![("Valid share of all pixels".into(), &valid)];
+    let mut rows: Vec<Row<'_>> = vec![("Valid share of all pixels".into(), &valid)];
     if comparison.entries.iter().any(|entry| entry.figures.report.truth.is_some()) {
         rows.push(("Coverage of the lit scene (truth)".into(), &coverage));
         rows.push(("Wrong codes among accepted".into(), &wrong));
