@@ -27,7 +27,7 @@ impl Notify {
             let socket = UnixDatagram::unbound()?;
             // A manager that does not listen must not hold up the service.
             socket.set_nonblocking(true)?;
-            Ok(socket)
+            Ok::<_, std::io::Error>(socket)
         };
         match address.and_then(|address| Ok((socket()?, address))) {
             Ok(socket) => Self(Some(socket)),
