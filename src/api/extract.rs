@@ -49,6 +49,11 @@ fn is_json(headers: &HeaderMap) -> bool {
 
 fn parse<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, Problem> {
     let bytes = if bytes.trim_ascii().is_empty() { b"{}" } else { bytes };
+    // Serde would take a list for an object with the same members in order.
+    if bytes.trim_ascii_start().first() == Some(&b'[') {
+        let errors = json!([{ "key": "", "message": "is a list" }]);
+        return Err(Kind::Invalid.with("the body is a list, expected an object").and("errors", errors));
+    }
     let mut reader = serde_json::Deserializer::from_slice(bytes);
     let value = serde_path_to_error::deserialize::<_, T>(&mut reader).map_err(|error| {
         let (path, inner) = (error.path().to_string(), error.inner());

@@ -23,7 +23,13 @@ impl Notify {
             Some(name) => SocketAddr::from_abstract_name(name),
             None => SocketAddr::from_pathname(&name),
         };
-        match address.and_then(|address| Ok((UnixDatagram::unbound()?, address))) {
+        let socket = || {
+            let socket = UnixDatagram::unbound()?;
+            // A manager that does not listen must not hold up the service.
+            socket.set_nonblocking(true)?;
+            Ok::<_, std::io::Error>(socket)
+        };
+        match address.and_then(|address| Ok((socket()?, address))) {
             Ok(socket) => Self(Some(socket)),
             Err(error) => {
                 tracing::warn!(%error, "the service manager cannot be told anything");

@@ -39,6 +39,9 @@ const BACKOFF: [Duration; 5] = [
 /// Longest time between two signs of life of an idle rig.
 const TICK: Duration = Duration::from_millis(500);
 
+/// From flip to steady light of a projector that was not measured.
+const UNMEASURED: Duration = Duration::from_millis(100);
+
 /// How long a frame for the preview is waited for, beyond its exposure.
 const PREVIEW_SLACK: Duration = Duration::from_millis(500);
 
@@ -368,7 +371,6 @@ impl Open {
         let size = ProjectorSize { width: info.width, height: info.height };
         let polarization = shared.settings.polarization;
         let raster = match shown {
-            Shown::Picture(Picture::Black) => return self.rig.projector.black().map(|_| ()).map_err(device),
             Shown::Picture(picture) => picture.raster(size, polarization),
             Shown::Pattern(role) => {
                 let modes = [shared.settings.mode, Mode::Pse, Mode::Gray];
@@ -384,7 +386,12 @@ impl Open {
             }
         };
         self.rig.projector.load(&[slide(raster)]).map_err(device)?;
-        self.rig.projector.show(0).map(|_| ()).map_err(device)
+        let receipt = self.rig.projector.show(0).map_err(device)?;
+        // Whoever asked may look at once.
+        let timing = self.rig.projector.info().timing;
+        let light = timing.map_or(UNMEASURED, |timing| timing.latency + timing.settling);
+        self.rig.clock.sleep_until(receipt.flipped + light);
+        Ok(())
     }
 
     fn preview(&mut self, shared: &Shared) -> Result<(), DeviceError> {

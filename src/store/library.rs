@@ -170,12 +170,11 @@ impl Library {
             if record.state == State::Queued && record.source.is_none() {
                 continue;
             }
-            let id = record.id.clone();
             let record = self.settle(record, now);
-            index.put(&record).map_err(fail)?;
+            let record = announce(&index, record).map_err(fail)?;
             self.write_record(&record)?;
             if record.state == State::Interrupted {
-                recovery.interrupted.push(id);
+                recovery.interrupted.push(record.id);
             }
         }
         let known: BTreeSet<String> = index.ids().map_err(fail)?.into_iter().map(|(id, _)| id).collect();
@@ -249,20 +248,26 @@ impl Library {
             let _ = fs::remove_dir_all(self.spool(&id));
             return record;
         }
-        let message = "the service ended before the scan did; its frames so far are kept";
+        let message = "the service ended before the scan did";
         match self.salvage(&id) {
-            Ok(Some(report)) => record.adopt(&report),
-            Ok(None) => {}
-            Err(error) => tracing::warn!(id, error = error.chain(), "what was captured could not be kept"),
+            Ok(Some((report, frames))) => {
+                record.adopt(&report);
+                record.progress.frames = report.frames;
+                record.progress.of = frames;
+            }
+            Ok(None) => record.blame(Diagnosis::Interrupted.slug(), message),
+            Err(error) => {
+                tracing::warn!(id, error = error.chain(), "what was captured could not be kept");
+                record.blame(Diagnosis::Interrupted.slug(), format!("{message}, but: {}", error.chain()));
+            }
         }
-        record.blame(Diagnosis::Interrupted.slug(), message);
         record.advance(State::Interrupted, now.to_owned());
         record.bytes = self.bundle_bytes(&id);
         record
     }
 
-    /// Makes a bundle of what was spooled, if anything was.
-    fn salvage(&self, id: &str) -> Result<Option<Report>, Failure> {
+    /// Makes a bundle of what was spooled, if anything was. Answers its report and how many frames there should have been.
+    fn salvage(&self, id: &str) -> Result<Option<(Report, usize)>, Failure> {
         let folder = self.spool(id);
         if !folder.is_dir() {
             return Ok(None);
@@ -277,7 +282,9 @@ impl Library {
             let reason = Reason::failed(Diagnosis::Interrupted, message, serde_json::Value::Null);
             let writer = BundleWriter::create(&self.bundle(id), None, 0)
                 .map_err(|error| Failure::storage("keep what was captured", error))?;
-            report = Some(crate::engine::salvage(spooled, reason, writer)?);
+            let parsed = manifest::Manifest::parse(&spooled.manifest);
+            let frames = parsed.map_or(0, |parsed| parsed.manifest.sequence.len());
+            report = Some((crate::engine::salvage(spooled, reason, writer)?, frames));
         }
         if let Err(error) = fs::remove_dir_all(&folder) {
             tracing::warn!(%error, "a spool that is done with still takes space");
@@ -291,16 +298,28 @@ impl Library {
         for entry in entries.flatten() {
             let name = entry.file_name();
             let Some(id) = name.to_str().filter(|name| is_id(name)) else { continue };
-            if index.get(id)?.is_some() {
+            match index.get(id)? {
+                // Its frames could not be kept so far, for want of space perhaps.
+                Some(mut known) if known.state == State::Interrupted && known.bytes.is_none() => {
+                    if let Ok(Some((report, _))) = self.salvage(id) {
+                        known.adopt(&report);
+                        known.bytes = self.bundle_bytes(id);
+                        announce(index, known)?;
+                    }
+                    continue;
+                }
                 // A spool that its scan has outlived: the result was written.
-                let _ = fs::remove_dir_all(entry.path());
-                continue;
+                Some(_) => {
+                    let _ = fs::remove_dir_all(entry.path());
+                    continue;
+                }
+                None => {}
             }
             let mut record = Record::new(id.to_owned(), String::new(), now.to_owned());
             record.state = State::Projecting;
             let record = self.settle(record, now);
             if let Some(record) = record.bytes.and_then(|_| self.read_record(id)) {
-                index.put(&record)?;
+                announce(index, record)?;
                 recovery.interrupted.push(id.to_owned());
             }
         }
@@ -348,6 +367,18 @@ impl Library {
         let id = path.file_name()?.to_str().filter(|id| is_id(id))?;
         (path.parent()? == self.folder).then(|| id.to_owned())
     }
+}
+
+/// Gives a scan that was settled the number of an event that tells of it, beyond all that were given out before.
+fn announce(index: &Index, mut record: Record) -> Result<Record, IndexError> {
+    let given =
+        index.number("events")?.unwrap_or(0).max(index.event_range()?.map_or(0, |(_, newest)| newest));
+    record.revision = given + 1;
+    index.set_number("events", record.revision)?;
+    index.put(&record)?;
+    let data = serde_json::to_string(&record).unwrap_or_default();
+    index.add_event(&index::Event { id: record.revision, kind: "scan".to_owned(), data })?;
+    Ok(record)
 }
 
 /// A message with all its causes.

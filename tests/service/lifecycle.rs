@@ -18,7 +18,7 @@ fn the_service_manager_is_told_and_the_running_scan_comes_to_its_end() {
     let mut daemon =
         Daemon::on(rig).with("NOTIFY_SOCKET", text(&path)).with("WATCHDOG_USEC", "2000000").started();
     let mut heard: Vec<String> = Vec::new();
-    let mut hear = |wanted: &str, heard: &mut Vec<String>| {
+    let hear = |wanted: &str, heard: &mut Vec<String>| {
         while !heard.iter().any(|text| text.starts_with(wanted)) {
             let mut buffer = [0; 1024];
             let length =
@@ -101,5 +101,17 @@ fn the_examples_do_what_they_say() {
         assert!(fs::read(&out).unwrap().starts_with(b"ply\n"));
     } else {
         eprintln!("curl or jq is missing: examples/scan.sh was not run");
+    }
+}
+
+#[test]
+fn the_sandbox_of_the_unit_is_as_tight_as_it_is_meant_to_be() {
+    let unit = Path::new(env!("CARGO_MANIFEST_DIR")).join("systemd/polscan.service");
+    let mut command = Command::new("systemd-analyze");
+    // In tenths: an exposure above 2.5 is an error.
+    command.args(["security", "--no-pager", "--offline=true", "--threshold=25"]).arg(&unit);
+    match command.output() {
+        Ok(done) => assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stdout)),
+        Err(error) => eprintln!("systemd-analyze is missing ({error}): the sandbox was not judged"),
     }
 }

@@ -15,14 +15,15 @@ const DEATHS: u64 = 8;
 
 /// What must hold after every start.
 fn check(daemon: &Daemon) -> Vec<Value> {
-    let scans = daemon.get("/v1/scans?limit=500").expect(200).json()["scans"].as_array().unwrap().clone();
+    let scans =
+        daemon.get("/v1/scans?limit=500").expect(200).json()["scans"].as_array().expect("scans").clone();
     let mut with_bundle: Vec<String> = Vec::new();
     for scan in &scans {
-        let state = scan["state"].as_str().unwrap();
+        let state = scan["state"].as_str().expect("a state");
         assert!(["done", "interrupted", "queued"].contains(&state), "{scan}");
         assert!(state != "queued" || scan["held"] == true, "{scan}");
         if !scan["bytes"].is_null() {
-            with_bundle.push(scan["id"].as_str().unwrap().to_owned());
+            with_bundle.push(scan["id"].as_str().expect("an identity").to_owned());
         }
     }
     with_bundle.sort();
@@ -33,9 +34,9 @@ fn check(daemon: &Daemon) -> Vec<Value> {
         let manifest = json_file(&bundle.join("manifest.json"));
         assert_eq!(manifest["id"], id.as_str());
         // Whatever is there is whole.
-        for (name, entry) in manifest["files"].as_object().unwrap() {
-            let bytes = fs::read(bundle.join(name)).unwrap();
-            assert_eq!(sha256(&bytes), entry["sha256"].as_str().unwrap(), "{name}");
+        for (name, entry) in manifest["files"].as_object().expect("files") {
+            let bytes = fs::read(bundle.join(name)).expect("a file of the manifest");
+            assert_eq!(sha256(&bytes), entry["sha256"].as_str().expect("a hash"), "{name}");
         }
         assert!(bundle.join("frames.npy").is_file() && bundle.join("report.json").is_file());
     }

@@ -17,7 +17,7 @@ struct SmallDisk<'a>(&'a Path);
 
 impl<'a> SmallDisk<'a> {
     fn mount(path: &'a Path, mib: u64) -> Option<Self> {
-        fs::create_dir_all(path).unwrap();
+        fs::create_dir_all(path).expect("a folder for the disk");
         let size = format!("size={mib}m");
         let done = Command::new("mount").args(["-t", "tmpfs", "-o", &size, "tmpfs", text(path)]).output();
         done.is_ok_and(|done| done.status.success()).then_some(Self(path))
@@ -46,6 +46,8 @@ fn a_full_disk_fails_the_scan_and_nothing_else() {
     let filler = disk.join("filler");
     let mut bytes = fs::File::create(&filler).unwrap();
     while std::io::Write::write_all(&mut bytes, &[7; 1 << 16]).is_ok() {}
+    // A file that is open takes its space even after it was removed.
+    drop(bytes);
     let scan = daemon.done(&id);
     assert_eq!((&scan["state"], &scan["error"]["type"]), (&json!("failed"), &json!("storage")), "{scan}");
     assert!(scan["bytes"].is_null() && daemon.bundles().is_empty(), "{:?}", daemon.bundles());

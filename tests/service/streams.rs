@@ -50,7 +50,7 @@ fn events_are_told_again_after_a_restart_and_their_numbers_go_on() {
         if violent {
             daemon.kill()
         } else {
-            drop(daemon.stop())
+            daemon.stop();
         }
         daemon.start();
         let mut replay = Events::follow(daemon.address(), Some(told[0].id));
@@ -105,7 +105,7 @@ fn the_preview_shows_what_the_projector_holds() {
     let (status, headers) = read_head(&mut stream);
     assert_eq!(status, 200);
     assert!(headers["content-type"].starts_with("multipart/x-mixed-replace"));
-    let mut text = Vec::new();
+    let mut text: Vec<u8> = Vec::new();
     let mut buffer = [0; 4096];
     while text.windows(13).filter(|window| window == b"polscan-frame").count() < 3 {
         let length = stream.read(&mut buffer).unwrap();

@@ -125,7 +125,8 @@ impl Owner {
             holder,
             finishing: self.finishing.len(),
             oldest_finishing: self.finishing.front().and_then(|id| self.holder(id)),
-            runnable: self.queue.iter().filter(|waiting| !waiting.held).count(),
+            // Who only waits for the rig to be opened takes no place of those that wait for others.
+            runnable: self.queue.iter().filter(|waiting| !waiting.held && !waiting.urgent).count(),
             held: self.queue.iter().filter(|waiting| waiting.held).count(),
             capacity: self.settings.raw.scan.queue_capacity,
         }
