@@ -389,8 +389,8 @@ mod tests {
         record.state = state;
         record.label = Some(format!("label {}", id % 3));
         record.tags = (0..id % 4).map(|tag| format!("tag {tag}")).collect();
-        record.pinned = id % 5 == 0;
-        record.bytes = (id % 2 == 0).then_some(10);
+        record.pinned = id.is_multiple_of(5);
+        record.bytes = (id.is_multiple_of(2)).then_some(10);
         record
     }
 

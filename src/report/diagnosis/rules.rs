@@ -127,7 +127,7 @@ fn from_pixels(input: &ReportInput, decoded: &Decoded, pixels: &PixelCounts) -> 
         ];
         reasons.retain(|reason| {
             let inverted = reason.diagnosis == Diagnosis::PolarizationInverted;
-            !follows.contains(&reason.diagnosis) && !(inverted && reason.severity != Verdict::Failed)
+            !(follows.contains(&reason.diagnosis) || inverted && reason.severity != Verdict::Failed)
         });
     }
     reasons
