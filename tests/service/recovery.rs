@@ -69,10 +69,15 @@ fn a_death_at_any_moment_leaves_a_store_that_agrees_with_itself() {
             assert!(seen < 3 || kept.is_u64(), "{after}");
         }
         assert_eq!(scans.len() as u64, death + 2);
-        daemon.post(&format!("/v1/scans/{waiting}/cancel"), &json!({}));
+        let cancelled = daemon.post(&format!("/v1/scans/{waiting}/cancel"), &json!({}));
+        let answer = String::from_utf8_lossy(&cancelled.body).into_owned();
+        assert!([202, 409].contains(&cancelled.status), "{} {answer}", cancelled.status);
         // Terminal states of earlier rounds included.
-        let state = daemon.state(&waiting)["state"].clone();
-        assert!(state == "cancelled" || state == "interrupted" || state == "done", "{state}");
+        let ended = |scan: &Value| {
+            !["queued", "projecting", "acquired", "decoding"].contains(&scan["state"].as_str().unwrap_or(""))
+        };
+        let state = daemon.until(&waiting, ended)["state"].clone();
+        assert!(state == "cancelled" || state == "interrupted" || state == "done", "{state} after {answer}");
         daemon.request("DELETE", &format!("/v1/scans/{waiting}"), &json!({})).expect(204);
     }
     daemon.finished_scan();

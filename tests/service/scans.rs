@@ -133,6 +133,8 @@ fn a_busy_rig_names_its_holder_and_a_queue_has_an_end() {
         Daemon::on(crate::rig::Rig::small().set("sim.pacing", "real-time").set("scan.queue_capacity", 2))
             .started();
     let first = daemon.scan(&json!({ "label": "holder" }));
+    // While the rig is first opened, its holder counts as waiting as well.
+    daemon.until(&first, |scan| scan["state"] == "projecting");
     let busy = daemon.post("/v1/scans", &json!({})).expect(409);
     assert_eq!(busy.slug(), "busy");
     assert_eq!(busy.json()["holder"]["id"], first.as_str());

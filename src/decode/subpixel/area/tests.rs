@@ -162,15 +162,20 @@ struct Found {
 fn agrees_with_an_independent_implementation() {
     let text = include_str!("../../../../tests/fixtures/partial-area.json");
     let reference: Reference = serde_json::from_str(text).unwrap();
-    let (mut compared, mut by_chance, mut tossed) = (0, 0, 0);
+    let (mut compared, mut by_chance, mut tossed, mut outside) = (0, 0, 0, 0);
     for case in &reference.cases {
         let name = format!("{} smoothed {} order {}", case.scene, case.smoothing, case.order);
         let mut missed = Vec::new();
         for edge in &case.edges {
             let (column, row) = (edge.pixel / reference.side, edge.pixel % reference.side);
-            // Steep edges are crossed along x, flat ones along y.
-            let along_x = edge.nx.abs() >= edge.ny.abs();
+            // Crossed along x, its y is a whole number, and the other way round; a normal tells less where noise is large.
+            let along_x = edge.y == f64::from(row);
             let (place, centre) = if along_x { (edge.x, column) } else { (edge.y, row) };
+            if (place - f64::from(centre)).abs() > 1.0 {
+                // Far outside its own pixel it is an artefact of noise, with windows of a kind that is not made here.
+                outside += 1;
+                continue;
+            }
             let slope = if along_x { -edge.ny / edge.nx } else { -edge.nx / edge.ny };
             let sample = |y: i32, t: i32| {
                 let (x, y) = if along_x { (column + t, row + y) } else { (column + y, row + t) };
@@ -204,7 +209,10 @@ fn agrees_with_an_independent_implementation() {
         println!("{name}: {} edges, missed {missed:?}", case.edges.len());
         assert!(missed.is_empty(), "{name}: {missed:?}");
     }
-    assert!(compared > 600 && by_chance == 0 && tossed <= 10, "{by_chance}, {tossed} of {compared}");
+    assert!(
+        compared > 600 && by_chance == 0 && tossed + outside <= 10,
+        "{by_chance}, {tossed}, {outside} of {compared}"
+    );
 }
 
 /// All reaches of the three lines up to the method's longest.
