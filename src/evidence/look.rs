@@ -1,7 +1,7 @@
 //! A closer look at a pair whose sum fails: where, by how much of the light, and whether a change of brightness
 //! explains it. Done only for pairs that fail, on a few hundred thousand pixels.
 //!
-//! Long because all looks share one sampling of the frames.
+//! The file is long because all looks share one sampling of the frames.
 
 use polscan_patterns::{Axis, Role};
 

@@ -1,4 +1,4 @@
-//! All reasons and notes of a report. Long because which reason silences which is told in one place.
+//! All reasons and notes of a report. The file is long because which reason silences which is told in one place.
 
 use serde_json::{Value, json};
 
