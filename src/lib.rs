@@ -4,15 +4,11 @@
 pub mod api;
 pub mod app;
 pub mod cli;
-pub mod cloud;
 pub mod commands;
 pub mod compare;
 pub mod config;
-pub mod decode;
 pub mod engine;
 mod evidence;
-pub mod geometry;
-pub mod grid;
 pub mod pipeline;
 pub mod report;
 pub mod scanner;
@@ -20,3 +16,5 @@ pub mod sequencer;
 pub mod store;
 pub mod truth;
 pub mod verify;
+
+pub use polscan_reconstruction::{cloud, decode, geometry, grid};

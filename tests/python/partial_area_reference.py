@@ -1,10 +1,10 @@
-"""Makes tests/fixtures/partial-area.json: edges that an independent implementation of the partial-area method finds.
+"""Makes reconstruction/tests/fixtures/partial-area.json: edges that an independent implementation of the partial-area method finds.
 
 The package `subpixel-edges` (PyPI, 0.1.1) finds edge pixels of small images and places the edge in each. Numbers only:
 images and what it said of them. Run by hand, outside the project's own environment:
 
     python -m venv /tmp/reference && /tmp/reference/bin/pip install subpixel-edges==0.1.1 numpy numba
-    /tmp/reference/bin/python tests/python/partial_area_reference.py > tests/fixtures/partial-area.json
+    /tmp/reference/bin/python tests/python/partial_area_reference.py > reconstruction/tests/fixtures/partial-area.json
 """
 
 import json

@@ -6,7 +6,7 @@ use super::*;
 use crate::{
     decode::{
         DecodeSettings, Plane,
-        tests::synth::{self, Rig, Spot},
+        synth::{self, Rig, Spot},
     },
     report::{Report, ReportInput, Size, Verdict, build, testing},
 };

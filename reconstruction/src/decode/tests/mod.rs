@@ -3,4 +3,3 @@
 mod exact;
 mod scenarios;
 mod simulated;
-pub(crate) mod synth;

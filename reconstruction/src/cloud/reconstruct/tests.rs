@@ -467,9 +467,9 @@ fn captured_vertical_baseline() {
     let folder = captures();
     let folder = folder.join("procam-chess/reference");
     let hints = ReadHints { projector_size: Some((1024, 768)), ..ReadHints::default() };
+    let name = "calibration_result_opencv4.11.xml";
     let calibration =
-        crate::store::source::read_calibration(&folder.join("calibration_result_opencv4.11.xml"), &hints)
-            .unwrap();
+        Calibration::from_bytes(&std::fs::read(folder.join(name)).unwrap(), name, &hints).unwrap();
     let map = |name: &str| reference_map(&folder.join(name));
     let decoded = decoded_maps(map("capture_0_col_u16.png"), map("capture_0_row_u16.png"));
     let settings = ReconstructSettings::new(1500.0, 6000.0);

@@ -16,6 +16,8 @@ mod pair_sum;
 mod plan;
 mod sample;
 mod subpixel;
+#[cfg(any(test, feature = "synthetic"))]
+pub mod synth;
 mod types;
 mod words;
 
@@ -30,4 +32,4 @@ pub use types::{
 };
 
 #[cfg(test)]
-pub(crate) mod tests;
+mod tests;

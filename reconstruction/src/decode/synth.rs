@@ -12,8 +12,9 @@ use crate::decode::{
 /// What a camera pixel sees.
 #[derive(Debug, Clone, Copy)]
 pub struct Spot {
-    /// Projector coordinate.
+    /// Projector column.
     pub u: f64,
+    /// Projector row.
     pub v: f64,
     /// Bright level as a share of the rig's full level; 0 where no projector light falls.
     pub reflectance: f64,
@@ -32,17 +33,25 @@ impl Default for Spot {
 /// A camera with its noise, and the blur of the whole chain.
 #[derive(Debug, Clone, Copy)]
 pub struct Rig {
+    /// Pixels of a row.
     pub width: usize,
+    /// Rows.
     pub height: usize,
+    /// Bits of a sample.
     pub bit_depth: u8,
+    /// Electrons at which a pixel is full.
     pub full_well: f64,
+    /// Read noise in electrons, standard deviation.
     pub read_electrons: f64,
+    /// Level without light.
     pub black_dn: f64,
+    /// Electrons of light that does not come from the projector.
     pub ambient_electrons: f64,
     /// Level of reflectance 1 as a share of full well.
     pub level: f64,
     /// Blur in camera px, standard deviation.
     pub blur_px: f64,
+    /// Frames of equal seeds are equal.
     pub seed: u64,
 }
 
@@ -142,11 +151,13 @@ pub trait Scene: Fn(f64, f64) -> Spot + Sync {}
 impl<F: Fn(f64, f64) -> Spot + Sync> Scene for F {}
 
 impl Rig {
+    /// The noise that this camera has.
     pub fn noise(&self) -> NoiseModel {
         let gain = f64::from((1u32 << self.bit_depth) - 1) / self.full_well;
         NoiseModel { gain_dn_per_electron: gain, read_noise_dn: gain * self.read_electrons }
     }
 
+    /// What a decoder is told of this camera.
     pub fn camera(&self) -> CameraResponse {
         CameraResponse {
             bit_depth: self.bit_depth,
@@ -218,6 +229,7 @@ impl Rig {
             .collect()
     }
 
+    /// Settings of a decode of its frames.
     pub fn settings(&self, sequence: &Sequence) -> DecodeSettings {
         DecodeSettings {
             mode: sequence.mode,
@@ -230,12 +242,20 @@ impl Rig {
         }
     }
 
+    /// What the decoder makes of a scan of a scene.
+    ///
+    /// # Panics
+    /// If the decoder refuses it.
     pub fn decode(&self, scene: &impl Scene, sequence: &Sequence) -> Decoded {
-        decode(self.settings(sequence), self.scan(scene, sequence)).unwrap()
+        decode(self.settings(sequence), self.scan(scene, sequence))
+            .expect("a scan of a known sequence decodes")
     }
 }
 
 /// Decodes frames; those of at most 8 bits as bytes.
+///
+/// # Errors
+/// As [`Accumulator::finish`].
 pub fn decode(settings: DecodeSettings, frames: Vec<(Role, Vec<u16>)>) -> Result<Decoded, DecodeError> {
     let bytes = settings.camera.bit_depth <= 8;
     let mut accumulator = Accumulator::new(settings)?;
@@ -250,8 +270,9 @@ pub fn decode(settings: DecodeSettings, frames: Vec<(Role, Vec<u16>)>) -> Result
     accumulator.finish()
 }
 
+/// The sequence of a mode on the projector of the paper.
 pub fn sequence(mode: Mode) -> Sequence {
-    Sequence::new(mode, ProjectorSize { width: 1024, height: 768 }).unwrap()
+    Sequence::new(mode, ProjectorSize { width: 1024, height: 768 }).expect("sizes in range")
 }
 
 /// Comparison of the columns with the truth over pixels away from surface borders.
@@ -261,17 +282,24 @@ pub struct Accuracy {
     pub coverage: f64,
     /// Share of the valid pixels off by more than 1.5.
     pub wrong: f64,
+    /// Root mean square of the error.
     pub rms: f64,
-    /// Robust and ordinary mean of the error.
+    /// Mean of the error.
     pub bias: f64,
     /// 1.4826 MAD of error / sigma.
     pub normalised: f64,
     /// Root mean square of error / sigma.
     pub normalised_rms: f64,
+    /// Median of the sigma that the decoder states.
     pub median_sigma: f64,
+    /// Share of the valid pixels without a sub-pixel position.
     pub fallback: f64,
 }
 
+/// Compares a decode with the truth in a region.
+///
+/// # Panics
+/// Where a valid pixel has no number, or the decode lacks the axis.
 pub fn accuracy(
     rig: &Rig,
     scene: &impl Scene,
@@ -279,7 +307,8 @@ pub fn accuracy(
     axis: Axis,
     region: impl Fn(usize, usize) -> bool,
 ) -> Accuracy {
-    let map = if axis == Axis::Column { &decoded.column } else { decoded.row.as_ref().unwrap() };
+    let map =
+        if axis == Axis::Column { &decoded.column } else { decoded.row.as_ref().expect("the mode has rows") };
     let (mut lit, mut wrong) = (0u64, 0u64);
     let (mut errors, mut normalised, mut sigmas) = (Vec::new(), Vec::new(), Vec::new());
     let mut fallback = 0u64;

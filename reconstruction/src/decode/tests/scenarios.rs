@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use polscan_patterns::{Axis, AxisCode, Mode, ProjectorSize, Role, Sequence};
 
-use super::synth::{Rig, Spot, accuracy, decode, normal, sequence};
+use crate::decode::synth::{Rig, Spot, accuracy, decode, normal, sequence};
 use crate::{
     decode::{
         Accumulator, Class, Contrast, DecodeError, DecodeSettings, Decoded, PairContext, Plane, Thresholds,

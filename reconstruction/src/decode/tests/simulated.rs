@@ -2,7 +2,7 @@
 
 use polscan_patterns::{Axis, Mode, Role};
 
-use super::synth::{Accuracy, Rig, Spot, accuracy, decode, erf, sequence, uniform};
+use crate::decode::synth::{Accuracy, Rig, Spot, accuracy, decode, erf, sequence, uniform};
 use crate::decode::{CameraResponse, Class, DecodeSettings, Decoded, PairContext, pair_residual};
 
 /// 15 % texture on patches of 5 px.

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use polscan_patterns::{AxisCode, Mode, ProjectorSize, Role, Sequence};
 use proptest::prelude::*;
 
-use super::synth::{normal, random, uniform};
+use crate::decode::synth::{normal, random, uniform};
 use crate::decode::{
     Accumulator, CameraResponse, Class, DecodeSettings, NoiseModel, SharedPlane, Thresholds, limits::Gates,
     oracle::decode_pixel, plan::plan, sample::Sample, words::decode_pixels,
@@ -193,15 +193,15 @@ fn random_pixels_cover_every_class_of_the_oracle() {
 
 #[test]
 fn result_is_the_same_to_the_bit_for_any_threads_and_order() {
-    let rig = super::synth::Rig { width: 150, height: 70, ..Default::default() };
-    let scene = |x: f64, y: f64| super::synth::Spot {
+    let rig = crate::decode::synth::Rig { width: 150, height: 70, ..Default::default() };
+    let scene = |x: f64, y: f64| crate::decode::synth::Spot {
         u: 300.0 + 0.34 * x + if x > 70.0 { 9.3 } else { 0.0 },
         v: 100.0 + 0.33 * y,
         reflectance: 0.1 + 0.05 * (x / 20.0).sin(),
         surface: u32::from(x > 70.0),
         ..Default::default()
     };
-    let sequence = super::synth::sequence(Mode::Pse);
+    let sequence = crate::decode::synth::sequence(Mode::Pse);
     let frames = rig.scan(&scene, &sequence);
     let settings =
         DecodeSettings { camera: CameraResponse { noise: None, ..rig.camera() }, ..rig.settings(&sequence) };
