@@ -5,7 +5,7 @@ use std::error::Error;
 use polscan::{config::Settings, report::Accuracy};
 use polscan_drivers::{
     camera::PixelFormat,
-    sim::{RigDescription, Scene},
+    sim::{RigDescription, Scene, Shape},
 };
 use polscan_patterns::Mode;
 
@@ -31,8 +31,8 @@ pub struct Sweep {
 
 /// Figures of one strip of the wedge.
 pub struct Strip {
-    /// Reflectance over that of the brightest strip.
-    pub reflectance: f64,
+    /// Level under uniform H over the full well; above 1 the frames that show it bright saturate.
+    pub level: f64,
     /// Its figures.
     pub figures: Option<Figures>,
 }
@@ -45,8 +45,8 @@ pub struct Measured {
     pub wedges: Vec<(Mode, Vec<Strip>)>,
     /// Position of single edges at reflectance 1 and 0.1, rms in projector px.
     pub edges: Vec<(f64, Option<f64>)>,
-    /// Decades down to which a pixel of the wedge reaches the lit gate of 4 sigma on the mean: with the rig's ambient
-    /// light, and without any.
+    /// Decades below the full well down to which a pixel of the wedge reaches the lit gate of 4 sigma on the mean: with
+    /// the rig's ambient light, and without any.
     pub range_limits: [f64; 2],
     /// The pinned scene, whole.
     pub pinned: polscan::report::Report,
@@ -165,8 +165,7 @@ pub fn all(base: &Settings) -> Result<Measured, Box<dyn Error>> {
                 "Exposure",
                 "exposure, us",
                 true,
-                "At 4000 us the white plate saturates in its H reference: nearly all its pixels stay, but with errors of whole \
-                 codes and a sigma that is too small. At 8000 us its pairs saturate and it is given up.",
+                "From 4000 us on the white plate is brighter than the full well.",
             ),
             &[125.0, 250.0, 500.0, 1000.0, 2000.0, 4000.0, 8000.0],
             |settings, value| {
@@ -286,9 +285,9 @@ pub fn all(base: &Settings) -> Result<Measured, Box<dyn Error>> {
 }
 
 /// Extinction of the projector on the wedge.
-const WEDGE_EXTINCTION: f64 = 10.0;
+pub const WEDGE_EXTINCTION: f64 = 10.0;
 
-/// Decades from the brightest level down to the one where modulation equals 4 sigma of a pattern less its inverse:
+/// Decades from the full well down to the level where modulation equals 4 sigma of a pattern less its inverse:
 /// `(1 - 1/e) H = 4 sqrt((1 + 1/e) H + 2 ambient + 2 read^2)` in electrons.
 fn range_limit(base: &Settings, ambient: f64) -> f64 {
     let Some((description, _)) = &base.sim else { return f64::NAN };
@@ -296,21 +295,36 @@ fn range_limit(base: &Settings, ambient: f64) -> f64 {
     let fixed = 2.0 * ambient + 2.0 * description.camera.read_noise_e.powi(2);
     let (a, b, c) = ((1.0 - leak).powi(2), gate * gate * (1.0 + leak), gate * gate * fixed);
     let least = (b + (b * b + 4.0 * a * c).sqrt()) / (2.0 * a);
-    (0.9 * description.camera.full_well_e / least).log10()
+    (description.camera.full_well_e / least).log10()
 }
+
+/// Level of the brightest strip over the full well: with an extinction of 10:1 its dark state still fits.
+const BRIGHTEST: f64 = 9.0;
+/// Strips in a decade.
+const STRIPS_PER_DECADE: u32 = 8;
+/// Strips of the wedge.
+const STRIPS: u32 = 4 * STRIPS_PER_DECADE + 3;
 
 /// Strips of the wedge at extinction 10:1, over the whole sensor.
 fn wedge(base: &Settings, mode: Mode) -> Result<Vec<Strip>, Box<dyn Error>> {
     let mut settings = base.clone();
     settings.mode = mode;
     rig(&mut settings)?.projector.extinction = [WEDGE_EXTINCTION; 3];
-    set_scene(&mut settings, include_str!("../../config/scenes/wedge.toml"))?;
+    let mut scene: Scene = toml::from_str(include_str!("../../config/scenes/wedge.toml"))?;
+    let object = scene.objects.first_mut().ok_or("the wedge's scene is empty")?;
+    object.level = Some(BRIGHTEST);
+    let Shape::Wedge(shape) = &mut object.shape else {
+        return Err("the wedge's scene holds no wedge".into());
+    };
+    shape.strips = STRIPS;
+    shape.decades = f64::from(STRIPS - 1) / f64::from(STRIPS_PER_DECADE);
+    settings.sim.as_mut().ok_or("the base configuration has no simulated rig")?.1 = scene;
     let report = report(&settings)?;
-    let strip = |number: usize| Strip {
-        reflectance: 10f64.powf(-0.25 * number as f64),
+    let strip = |number: u32| Strip {
+        level: BRIGHTEST * 10f64.powf(-f64::from(number) / f64::from(STRIPS_PER_DECADE)),
         figures: of_plane(&report, &format!("wedge-{number:02}")),
     };
-    Ok((0..17).map(strip).collect())
+    Ok((0..STRIPS).map(strip).collect())
 }
 
 /// Root mean square error of single edges: with fits through two edges only, a pixel beside an edge carries that edge's
@@ -334,14 +348,20 @@ fn edge_rms(base: &Settings, reflectance: f64) -> Result<Option<f64>, Box<dyn Er
     })
 }
 
-/// Decades between the brightest and the darkest strip down to which all strips have at least 95 % coverage and at most
-/// 0.1 % wrong.
-pub fn decades(strips: &[Strip]) -> f64 {
-    let good = |strip: &&Strip| {
+/// Level of the brightest and of the darkest strip of the longest run of strips that all have at least 95 % coverage and
+/// at most 0.1 % wrong.
+pub fn range(strips: &[Strip]) -> Option<(f64, f64)> {
+    let good = |strip: &Strip| {
         let Some(Figures { accuracy: Accuracy { coverage, wrong_code_rate, .. }, .. }) = strip.figures else {
             return false;
         };
         coverage.is_some_and(|share| share >= 0.95) && wrong_code_rate.is_some_and(|rate| rate <= 1e-3)
     };
-    strips.iter().take_while(good).last().map_or(0.0, |strip| -strip.reflectance.log10())
+    let runs = strips.chunk_by(|one, next| good(one) == good(next)).filter(|run| good(&run[0]));
+    runs.max_by_key(|run| run.len()).map(|run| (run[0].level, run[run.len() - 1].level))
+}
+
+/// Decades of [`range`].
+pub fn decades(strips: &[Strip]) -> f64 {
+    range(strips).map_or(0.0, |(brightest, darkest)| (brightest / darkest).log10())
 }

@@ -8,5 +8,6 @@ mod cases;
 mod compare;
 mod faults;
 mod patterns;
+mod projection;
 mod refusals;
 mod rig;

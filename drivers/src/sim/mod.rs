@@ -32,6 +32,7 @@ mod noise;
 mod optics;
 mod panel;
 mod polarization;
+mod projection;
 mod projector;
 mod render;
 mod rig;
@@ -49,6 +50,7 @@ pub use description::{
     AmbientDescription, AnalyserDescription, CameraDescription, FlickerDescription, Pacing,
     PanelPolarization, PoseDescription, ProjectorDescription, RigDescription,
 };
+pub use projection::Projection;
 pub use projector::SimProjectors;
 pub use rig::{Rig, RigError, Truth, TruthObject};
 pub use scene::{Material, Object, Plane, Scene, Shape, Sphere, Step, VGroove, Wedge};
