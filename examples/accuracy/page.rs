@@ -144,6 +144,7 @@ fn shortfalls(page: &mut String, measured: &Measured) -> Result<(), Box<dyn Erro
     let strips = measured.wedges.first().map_or(&[][..], |(_, strips)| strips);
     let (brightest, darkest) = range(strips).unwrap_or((f64::NAN, f64::NAN));
     let decades = decades(strips);
+    let clipped = 2.0 / (1.0 + 1.0 / WEDGE_EXTINCTION);
     let reached = if decades >= 3.1 { "reaches the aim of 3.1" } else { "is short of the aim of 3.1" };
     let dishonest = |strip: &&Strip| {
         strip.figures.is_some_and(|figures| {
@@ -155,12 +156,12 @@ fn shortfalls(page: &mut String, measured: &Measured) -> Result<(), Box<dyn Erro
     writeln!(
         page,
         "## What falls short, and why\n\n\
-         - **Range of reflectance**: {decades:.2} decades {reached}: from {brightest:.2} times the full well, where the bright \
-         state is clipped and only\n  the dark one still measures light, down to {darkest:.5} of it. Downwards the lit gate ends \
-         it: modulation `(1 - 1/e) H` sinks to 4 sigma of\n  a pattern less its inverse, `sqrt((1 + 1/e) H + 2 ambient + 2 \
-         read^2)` in electrons, {with:.2} decades below the full well ({without:.2} without\n  any ambient light), before any blur. \
-         Upwards the extinction of the projector ends it: at more than {WEDGE_EXTINCTION} times the full well the dark state \
-         is\n  clipped as well."
+         - **Range of reflectance**: {decades:.2} decades {reached}: from {brightest:.2} times the full well, down to \
+         {darkest:.5} of it.\n  Downwards the lit gate ends it: modulation `(1 - 1/e) H` sinks to 4 sigma of a pattern less its \
+         inverse, `sqrt((1 + 1/e) H + 2 ambient + 2 read^2)`\n  in electrons, {with:.2} decades below the full well \
+         ({without:.2} without any ambient light), before any blur. Upwards pixels on the edge of a stripe end\n  it: both \
+         frames of the pair show half of the light there, `(1 + 1/e) H / 2`, and are clipped together from {clipped:.2} times the \
+         full well on; a pair that\n  is clipped twice carries no bit."
     )?;
     if !weak.is_empty() {
         let list: Vec<String> = weak
