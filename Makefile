@@ -1,5 +1,5 @@
 # Two commands are all that is needed: `make run` and `make test`. Both install what is missing first.
-.PHONY: run serve test captures foreign-plane faults fuzz accuracy setup install ci
+.PHONY: run serve test captures foreign-plane faults soak kills service-figures fuzz accuracy setup install ci
 
 run: ## build, serve the simulated rig, scan it over REST, say where the results are
 	@scripts/install build
@@ -20,6 +20,18 @@ captures: ## decode real captures made by others (POLSCAN_CAPTURES names their f
 faults: ## let everything go wrong on the simulated rig, and see what it is called
 	@scripts/install build
 	@scripts/faults
+
+soak: ## 200 scans in a row with polling and following clients, and lists of 10 000 scans
+	@scripts/install build
+	@scripts/soak two_hundred_scans ten_thousand_scans
+
+kills: ## 50 deaths of the service at random moments under load
+	@scripts/install build
+	@scripts/soak fifty_deaths
+
+service-figures: ## what the service costs: time to the first pattern, overhead, answers while it decodes
+	@scripts/install build
+	@scripts/soak figures
 
 foreign-plane: ## check the decoder from outside, with an independent numpy model
 	@scripts/install test

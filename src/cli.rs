@@ -81,7 +81,7 @@ struct Serve {
 
 #[derive(Debug, Subcommand)]
 enum Token {
-    /// Make a token and print it; the file keeps only its hash. A running service learns of it when it is started again.
+    /// Make a token and print it; the file keeps only its hash. A running service knows it within a second.
     Add {
         /// Name of the token, for the one who looks after the file.
         name: String,
@@ -89,6 +89,20 @@ enum Token {
         #[arg(long)]
         scope: Scope,
         /// File of tokens, as in api.tokens; made with mode 0600 where it is missing.
+        #[arg(long, value_name = "FILE")]
+        file: PathBuf,
+    },
+    /// Print name and scope of every token of a file.
+    List {
+        /// File of tokens, as in api.tokens.
+        #[arg(long, value_name = "FILE")]
+        file: PathBuf,
+    },
+    /// Take a token out of a file. A running service refuses it within a second.
+    Revoke {
+        /// Name of the token.
+        name: String,
+        /// File of tokens, as in api.tokens.
         #[arg(long, value_name = "FILE")]
         file: PathBuf,
     },
@@ -282,6 +296,8 @@ fn dispatch(cli: &Cli) -> Result<u8, Failure> {
             commands::serve(settings, args.address_file.as_deref(), cli.json)
         }
         Command::Token(Token::Add { name, scope, file }) => commands::add_token(file, name, *scope, cli.json),
+        Command::Token(Token::List { file }) => commands::list_tokens(file, cli.json),
+        Command::Token(Token::Revoke { name, file }) => commands::revoke_token(file, name, cli.json),
         Command::Store(Store::Reindex(args)) => {
             commands::reindex(&layers(args, Vec::new()).load()?, cli.json)
         }

@@ -4,9 +4,11 @@ use std::{
     fmt,
     io::Write,
     net::IpAddr,
-    os::unix::fs::{OpenOptionsExt, PermissionsExt},
+    os::unix::fs::{MetadataExt, OpenOptionsExt, PermissionsExt, fchown},
     path::{Path, PathBuf},
     str::FromStr,
+    sync::{Arc, Mutex, PoisonError},
+    time::{Duration, Instant},
 };
 
 use axum::http::{HeaderMap, Method, Uri, header, uri::Authority};
@@ -95,6 +97,14 @@ pub enum TokenError {
         "`{0}` cannot name a token: use letters, digits, - and _, and a name that is not in the file yet"
     )]
     Name(String),
+    /// A name that no token has.
+    #[error("no token in {} is named `{name}`; `polscan token list` names them", path.display())]
+    Unknown {
+        /// The file.
+        path: PathBuf,
+        /// The name.
+        name: String,
+    },
     /// There is no token.
     #[error("the token file {} has no token: make one with `polscan token add`", path.display())]
     Empty {
@@ -114,7 +124,7 @@ struct Token {
 }
 
 /// The tokens of a file. Only their hashes are known; they are random enough that a plain hash cannot be reversed.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub struct Tokens(Vec<Token>);
 
 impl Tokens {
@@ -143,6 +153,11 @@ impl Tokens {
             return Err(TokenError::Empty { path: path.to_owned() });
         }
         Ok(tokens)
+    }
+
+    /// Name and scope of each, in the order of the file.
+    pub fn names(&self) -> impl Iterator<Item = (&str, Scope)> {
+        self.0.iter().map(|token| (token.name.as_str(), token.scope))
     }
 
     /// What `secret` allows. Takes as long for a wrong one as for a right one.
@@ -189,6 +204,99 @@ pub fn add_token(path: &Path, name: &str, scope: Scope) -> Result<String, TokenE
     Ok(secret)
 }
 
+/// Takes a token out of the file, which changes at once and as a whole and keeps its owner.
+pub fn revoke_token(path: &Path, name: &str) -> Result<(), TokenError> {
+    let fail = |source| TokenError::File { operation: "write", path: path.to_owned(), source };
+    if Tokens::read(path)?.names().all(|(known, _)| known != name) {
+        return Err(TokenError::Unknown { path: path.to_owned(), name: name.to_owned() });
+    }
+    let text = std::fs::read_to_string(path).map_err(fail)?;
+    let left: String = text
+        .split_inclusive('\n')
+        .filter(|line| line.starts_with('#') || line.split_whitespace().next() != Some(name))
+        .collect();
+    let mut fresh = path.as_os_str().to_owned();
+    fresh.push(".new");
+    let write = || {
+        let owner = std::fs::metadata(path)?;
+        let _ = std::fs::remove_file(&fresh);
+        let mut file = std::fs::File::options().create_new(true).write(true).mode(0o600).open(&fresh)?;
+        // Somebody else may do this than who runs the service.
+        fchown(&file, Some(owner.uid()), Some(owner.gid()))?;
+        file.write_all(left.as_bytes())?;
+        file.sync_all()?;
+        std::fs::rename(&fresh, path)
+    };
+    write().map_err(fail)
+}
+
+/// How soon a change of the file is noticed.
+const FRESH: Duration = Duration::from_secs(1);
+
+/// What tells one state of a file from another: inode, length, and when it was changed.
+type Stamp = (u64, u64, i64, i64);
+
+/// The tokens of a running service, which follows the changes of their file.
+#[derive(Debug)]
+pub struct TokenFile {
+    path: PathBuf,
+    known: Mutex<Known>,
+}
+
+#[derive(Debug)]
+struct Known {
+    tokens: Arc<Tokens>,
+    stamp: Option<Stamp>,
+    looked: Instant,
+}
+
+impl TokenFile {
+    /// A file that must hold at least one token now.
+    pub fn open(path: &Path) -> Result<Self, TokenError> {
+        // Before the content: a change in between is then read once more than needed, not once less.
+        let stamp = stamp(path);
+        let tokens = Arc::new(Tokens::required(path)?);
+        let known = Mutex::new(Known { tokens, stamp, looked: Instant::now() });
+        Ok(Self { path: path.to_owned(), known })
+    }
+
+    /// The tokens as they are, or were a moment ago. A file that cannot be used lets nobody in until it is mended: what
+    /// it revoked must not go on.
+    fn current(&self) -> Arc<Tokens> {
+        let mut known = self.known.lock().unwrap_or_else(PoisonError::into_inner);
+        if known.looked.elapsed() >= FRESH {
+            self.look(&mut known);
+        }
+        known.tokens.clone()
+    }
+
+    /// Follows the file now.
+    pub fn refresh(&self) {
+        self.look(&mut self.known.lock().unwrap_or_else(PoisonError::into_inner));
+    }
+
+    fn look(&self, known: &mut Known) {
+        known.looked = Instant::now();
+        let stamp = stamp(&self.path);
+        if stamp == known.stamp {
+            return;
+        }
+        known.stamp = stamp;
+        known.tokens = Arc::new(Tokens::read(&self.path).unwrap_or_else(|error| {
+            let error = crate::store::library::chain(&error);
+            tracing::error!(error, "nobody is let in before the token file is mended");
+            Tokens::default()
+        }));
+        tracing::info!(tokens = known.tokens.0.len(), "the token file was read again");
+    }
+}
+
+fn stamp(path: &Path) -> Option<Stamp> {
+    // The time of the inode: it moves with content, mode and owner, and no program can set it back.
+    let data = std::fs::metadata(path).ok()?;
+    Some((data.ino(), data.len(), data.ctime(), data.ctime_nsec()))
+}
+
 /// What a request needs.
 fn needed(method: &Method, path: &str) -> Option<Scope> {
     let open = ["/livez", "/readyz", "/", "/docs", "/openapi.json"];
@@ -207,7 +315,7 @@ fn needed(method: &Method, path: &str) -> Option<Scope> {
 #[derive(Debug, Clone)]
 pub struct Gate {
     /// Tokens; without any, this machine alone is served.
-    pub tokens: Option<Tokens>,
+    pub tokens: Option<Arc<TokenFile>>,
     /// Address that the service listens on.
     pub address: IpAddr,
 }
@@ -217,7 +325,7 @@ impl Gate {
     pub fn check(&self, method: &Method, uri: &Uri, headers: &HeaderMap) -> Result<(), Problem> {
         let Some(needed) = needed(method, uri.path()) else { return Ok(()) };
         match &self.tokens {
-            Some(tokens) => check_token(tokens, needed, headers),
+            Some(tokens) => check_token(&tokens.current(), needed, headers),
             None => self.check_machine(method, uri, headers),
         }
     }
@@ -276,7 +384,7 @@ mod tests {
 
     use super::*;
 
-    fn gate(tokens: Option<Tokens>) -> Gate {
+    fn gate(tokens: Option<Arc<TokenFile>>) -> Gate {
         Gate { tokens, address: IpAddr::from([127, 0, 0, 1]) }
     }
 
@@ -325,7 +433,7 @@ mod tests {
         let path = folder.path().join("tokens");
         let secrets: Vec<String> =
             Scope::ALL.iter().map(|scope| add_token(&path, scope.name(), *scope).unwrap()).collect();
-        let gate = gate(Some(Tokens::required(&path).unwrap()));
+        let gate = gate(Some(Arc::new(TokenFile::open(&path).unwrap())));
         let cases = [
             (Method::GET, "/v1/scans", Scope::Read),
             (Method::GET, "/metrics", Scope::Read),
@@ -350,6 +458,47 @@ mod tests {
             }
         }
         assert_eq!(status(&gate, Method::GET, "/livez", &[]), None);
+    }
+
+    #[test]
+    fn changes_of_the_file_are_followed() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("tokens");
+        let first = add_token(&path, "first", Scope::Admin).unwrap();
+        let file = TokenFile::open(&path).unwrap();
+        let scope = |secret: &str| {
+            file.refresh();
+            file.current().scope(secret)
+        };
+        let second = add_token(&path, "second", Scope::Read).unwrap();
+        assert_eq!((scope(&first), scope(&second)), (Some(Scope::Admin), Some(Scope::Read)));
+        revoke_token(&path, "first").unwrap();
+        assert_eq!((scope(&first), scope(&second)), (None, Some(Scope::Read)));
+        assert_eq!(std::fs::metadata(&path).unwrap().permissions().mode() & 0o777, 0o600);
+        // What cannot be used lets nobody in, and is mended as it was broken.
+        std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o644)).unwrap();
+        assert_eq!(scope(&second), None);
+        std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o600)).unwrap();
+        assert_eq!(scope(&second), Some(Scope::Read));
+        std::fs::remove_file(&path).unwrap();
+        assert_eq!(scope(&second), None);
+    }
+
+    #[test]
+    fn a_token_is_revoked_alone() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("tokens");
+        for name in ["a", "ab", "b"] {
+            add_token(&path, name, Scope::Scan).unwrap();
+        }
+        let with_note = format!("# a note\n{}", std::fs::read_to_string(&path).unwrap());
+        std::fs::write(&path, &with_note).unwrap();
+        assert!(matches!(revoke_token(&path, "c"), Err(TokenError::Unknown { .. })));
+        assert_eq!(std::fs::read_to_string(&path).unwrap(), with_note);
+        revoke_token(&path, "a").unwrap();
+        let left = Tokens::read(&path).unwrap();
+        assert_eq!(left.names().collect::<Vec<_>>(), [("ab", Scope::Scan), ("b", Scope::Scan)]);
+        assert!(std::fs::read_to_string(&path).unwrap().starts_with("# a note\nab "));
     }
 
     #[test]

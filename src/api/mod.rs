@@ -10,6 +10,7 @@ mod problem;
 mod scans;
 mod server;
 mod system;
+mod tls;
 mod wire;
 
 use std::{
@@ -40,9 +41,10 @@ use crate::{
     store::{Index, IndexError, library::chain},
 };
 
-pub use auth::{Gate, Scope, TokenError, Tokens, add_token};
+pub use auth::{Gate, Scope, TokenError, TokenFile, Tokens, add_token, revoke_token};
 use problem::{Kind, Problem};
 pub use server::{Listening, serve};
+pub use tls::{Tls, TlsError};
 
 /// A place among the streams; dropping it gives it back.
 pub type Place = OwnedSemaphorePermit;
@@ -68,7 +70,7 @@ impl App {
     pub fn new(
         scanner: Scanner,
         settings: Settings,
-        tokens: Option<Tokens>,
+        tokens: Option<Arc<TokenFile>>,
         address: IpAddr,
         stopping: watch::Receiver<bool>,
     ) -> Self {

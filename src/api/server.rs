@@ -9,18 +9,21 @@ use std::{
 use axum::Router;
 use hyper_util::{
     rt::{TokioIo, TokioTimer},
-    server::graceful::GracefulShutdown,
+    server::graceful::{GracefulShutdown, Watcher},
     service::TowerToHyperService,
 };
 use tokio::{
+    io::{AsyncRead, AsyncWrite},
     net::TcpListener,
     sync::{Semaphore, watch},
 };
 
+use super::tls::Tls;
+
 /// Connections at once.
 const CONNECTIONS: usize = 512;
 
-/// How long a client may take over the head of a request.
+/// How long a client may take over the head of a request, and before that over the greeting of TLS.
 const PATIENCE: Duration = Duration::from_secs(10);
 
 /// How long requests may go on after the end has been asked for.
@@ -51,8 +54,13 @@ impl Listening {
     }
 }
 
-/// Serves until `stopping` says so, then lets requests end.
-pub async fn serve(listening: Listening, routes: Router, mut stopping: watch::Receiver<bool>) {
+/// Serves until `stopping` says so, then lets requests end. With `tls` nothing is understood that is not encrypted.
+pub async fn serve(
+    listening: Listening,
+    routes: Router,
+    tls: Option<Tls>,
+    mut stopping: watch::Receiver<bool>,
+) {
     let graceful = GracefulShutdown::new();
     let places = Arc::new(Semaphore::new(CONNECTIONS));
     loop {
@@ -71,18 +79,33 @@ pub async fn serve(listening: Listening, routes: Router, mut stopping: watch::Re
         };
         let Ok(place) = places.clone().try_acquire_owned() else { continue };
         let _ = stream.set_nodelay(true);
-        let service = TowerToHyperService::new(routes.clone());
-        let connection = hyper::server::conn::http1::Builder::new()
-            .timer(TokioTimer::new())
-            .header_read_timeout(PATIENCE)
-            .serve_connection(TokioIo::new(stream), service);
-        let connection = graceful.watch(connection);
+        let (routes, acceptor, watcher) =
+            (routes.clone(), tls.as_ref().map(Tls::acceptor), graceful.watcher());
         tokio::spawn(async move {
-            // A client that goes away in the middle is no news.
-            let _ = connection.await;
+            match acceptor {
+                None => converse(stream, routes, watcher).await,
+                Some(acceptor) => match tokio::time::timeout(PATIENCE, acceptor.accept(stream)).await {
+                    Ok(Ok(stream)) => converse(stream, routes, watcher).await,
+                    Ok(Err(error)) => tracing::debug!(%error, "a client and TLS"),
+                    Err(_) => {}
+                },
+            }
             drop(place);
         });
     }
     drop(listening);
     let _ = tokio::time::timeout(FAREWELL, graceful.shutdown()).await;
+}
+
+/// Answers the requests of one connection.
+async fn converse<S>(stream: S, routes: Router, watcher: Watcher)
+where
+    S: AsyncRead + AsyncWrite + Unpin + Send + 'static,
+{
+    let connection = hyper::server::conn::http1::Builder::new()
+        .timer(TokioTimer::new())
+        .header_read_timeout(PATIENCE)
+        .serve_connection(TokioIo::new(stream), TowerToHyperService::new(routes));
+    // A client that goes away in the middle is no news.
+    let _ = watcher.watch(connection).await;
 }

@@ -4,7 +4,7 @@ use std::{path::Path, time::SystemTime};
 
 use super::say;
 use crate::{
-    api::{self, Scope},
+    api::{self, Scope, Tokens},
     config::Settings,
     engine::Failure,
     store::{Library, time::rfc3339_utc},
@@ -17,6 +17,32 @@ pub fn add_token(file: &Path, name: &str, scope: Scope, json: bool) -> Result<u8
     match json {
         true => say(serde_json::json!({ "name": name, "scope": scope.to_string(), "token": token })),
         false => say(token),
+    }
+    Ok(0)
+}
+
+/// Prints what a file of tokens allows whom.
+pub fn list_tokens(file: &Path, json: bool) -> Result<u8, Failure> {
+    let tokens = Tokens::read(file).map_err(|error| Failure::storage("list the tokens of a file", error))?;
+    if json {
+        let all: Vec<_> = tokens
+            .names()
+            .map(|(name, scope)| serde_json::json!({ "name": name, "scope": scope.to_string() }))
+            .collect();
+        say(serde_json::json!({ "tokens": all }));
+    } else {
+        tokens.names().for_each(|(name, scope)| say(format_args!("{name} {scope}")));
+    }
+    Ok(0)
+}
+
+/// Takes a token out of a file.
+pub fn revoke_token(file: &Path, name: &str, json: bool) -> Result<u8, Failure> {
+    api::revoke_token(file, name)
+        .map_err(|error| Failure::storage(format!("revoke the token {name}"), error))?;
+    match json {
+        true => say(serde_json::json!({ "revoked": name })),
+        false => say(format_args!("{name} is revoked")),
     }
     Ok(0)
 }

@@ -16,7 +16,7 @@ use std::{io::Write, path::Path};
 
 use crate::report::{self, Outputs, Report, Verdict};
 
-pub use admin::{add_token, openapi, reindex};
+pub use admin::{add_token, list_tokens, openapi, reindex, revoke_token};
 pub use check_config::check_config;
 pub use compare::{CompareArgs, compare};
 pub use decode::decode;

@@ -15,7 +15,7 @@ use tokio::{
 
 use super::{notify::Notify, say};
 use crate::{
-    api::{self, App, Listening, Tokens},
+    api::{self, App, Listening, Tls, TokenFile},
     config::Settings,
     engine::Failure,
     scanner::{self, RigState, Scanner, Snapshot, Threads},
@@ -38,8 +38,10 @@ fn setup(operation: &'static str, source: impl std::error::Error + Send + Sync +
 /// Serves until it is asked to end. Writes the address that it listens on to `address_file`, if given.
 pub fn serve(settings: Settings, address_file: Option<&Path>, json: bool) -> Result<u8, Failure> {
     let start = Instant::now();
-    let tokens = settings.tokens.as_deref().map(Tokens::required).transpose();
-    let tokens = tokens.map_err(|error| setup("use the access tokens", error))?;
+    let tokens = settings.tokens.as_deref().map(TokenFile::open).transpose();
+    let tokens = tokens.map_err(|error| setup("use the access tokens", error))?.map(Arc::new);
+    let tls = settings.tls.as_ref().map(|(certificate, key)| Tls::read(certificate, key)).transpose();
+    let tls = tls.map_err(|error| setup("use the certificate of the interface", error))?;
     let storage = |error| Failure::storage("open the store of scans", error);
     let library = Library::open(Path::new(&settings.raw.store.dir)).map_err(storage)?;
     let (index, recovery) = library.recover(&rfc3339_utc(SystemTime::now())).map_err(storage)?;
@@ -54,13 +56,18 @@ pub fn serve(settings: Settings, address_file: Option<&Path>, json: bool) -> Res
         .block_on(Listening::bind(settings.listen))
         .map_err(|error| setup("listen on the address in api.listen", error))?;
     let address = listening.address();
+    if !address.ip().is_loopback() && tls.is_none() {
+        tracing::warn!(%address, "tokens and scans cross the network unencrypted: set api.tls_certificate and api.tls_key");
+    }
     let (scanner, threads) = scanner::start(settings.clone(), library, index)
         .map_err(|error| setup("start the threads of the scanner", error))?;
     let (stop, stopping) = watch::channel(false);
-    let app = App::new(scanner.clone(), settings, tokens, listening.ip(), stopping.clone());
+    let app = App::new(scanner.clone(), settings, tokens.clone(), listening.ip(), stopping.clone());
     runtime.block_on(async {
-        let served = tokio::spawn(api::serve(listening, api::service(app), stopping));
-        announce(address, scanner.folder(), address_file, json)?;
+        let url = format!("{}://{address}", if tls.is_some() { "https" } else { "http" });
+        let reloads = tokio::spawn(read_again(tokens, tls.clone(), signal(SignalKind::hangup())));
+        let served = tokio::spawn(api::serve(listening, api::service(app), tls, stopping));
+        announce(address, &url, scanner.folder(), address_file, json)?;
         let notify = Arc::new(Notify::from_environment());
         notify.send("READY=1");
         let elapsed_ms = start.elapsed().as_secs_f64() * 1e3;
@@ -72,6 +79,7 @@ pub fn serve(settings: Settings, address_file: Option<&Path>, json: bool) -> Res
         // Now whoever waited has its answer, and streams may break off.
         stop.send_replace(true);
         let _ = served.await;
+        reloads.abort();
         supervised.abort();
         status.abort();
         Ok(0)
@@ -94,7 +102,13 @@ fn report(recovery: &Recovery) {
 }
 
 /// Says where the service is: on stdout, and in a file for scripts.
-fn announce(address: SocketAddr, store: &Path, file: Option<&Path>, json: bool) -> Result<(), Failure> {
+fn announce(
+    address: SocketAddr,
+    url: &str,
+    store: &Path,
+    file: Option<&Path>,
+    json: bool,
+) -> Result<(), Failure> {
     if let Some(file) = file {
         let fresh = file.with_extension("new");
         let write = || {
@@ -104,15 +118,35 @@ fn announce(address: SocketAddr, store: &Path, file: Option<&Path>, json: bool) 
         write().map_err(|error| Failure::storage("write the address file", error))?;
     }
     match json {
-        true => {
-            say(serde_json::json!({ "address": address, "url": format!("http://{address}"), "store": store }))
-        }
-        false => say(format_args!(
-            "polscan serves http://{address}/ (interface: /docs), scans in {}",
-            store.display()
-        )),
+        true => say(serde_json::json!({ "address": address, "url": url, "store": store })),
+        false => say(format_args!("polscan serves {url}/ (interface: /docs), scans in {}", store.display())),
     }
     Ok(())
+}
+
+/// Reads tokens and certificate again at every SIGHUP.
+async fn read_again(
+    tokens: Option<Arc<TokenFile>>,
+    tls: Option<Tls>,
+    hangup: std::io::Result<tokio::signal::unix::Signal>,
+) {
+    let Ok(mut hangup) = hangup else {
+        tracing::error!("SIGHUP cannot be received; certificates are read at the start only");
+        return;
+    };
+    while hangup.recv().await.is_some() {
+        if let Some(tokens) = &tokens {
+            tokens.refresh();
+        }
+        match tls.as_ref().map(Tls::read_again) {
+            Some(Ok(())) => tracing::info!("the certificate was read again"),
+            Some(Err(error)) => {
+                let error = crate::store::library::chain(&error);
+                tracing::error!(error, "the certificate that was read before stays in use");
+            }
+            None => {}
+        }
+    }
 }
 
 /// Returns at the first signal to end; a second one ends the process at once.
@@ -138,8 +172,9 @@ async fn asked_to_end() {
 
 /// Ends the scanner. The running scan comes to its end, or is cut short after a while; queued ones stay queued.
 async fn end(scanner: &Scanner, threads: Threads, notify: &Notify) {
-    notify.send("STOPPING=1");
+    // First: whoever hears that the service is ending must not get a scan from it any more.
     scanner.stop(GRACE);
+    notify.send("STOPPING=1");
     let mut joined = tokio::task::spawn_blocking(move || threads.join());
     while tokio::time::timeout(PATIENCE, &mut joined).await.is_err() {
         notify.send(&format!("EXTEND_TIMEOUT_USEC={}", 2 * PATIENCE.as_micros()));

@@ -41,6 +41,10 @@ pub struct Api {
     pub listen: String,
     /// File of tokens, relative to the configuration file; empty for none.
     pub tokens: String,
+    /// Certificate in PEM form, relative to the configuration file; empty for none.
+    pub tls_certificate: String,
+    /// Its key, likewise.
+    pub tls_key: String,
     /// Requests at once.
     pub concurrency: usize,
     /// Streams at once.

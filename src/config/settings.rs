@@ -51,6 +51,8 @@ pub struct Settings {
     pub listen: SocketAddr,
     /// File of tokens, resolved against the folder of the configuration.
     pub tokens: Option<PathBuf>,
+    /// Files of certificate and key, resolved against the folder of the configuration.
+    pub tls: Option<(PathBuf, PathBuf)>,
 }
 
 impl Settings {
@@ -74,6 +76,7 @@ impl Settings {
         let calibration = calibration(&raw.rig, folder, faults);
         let tokens = (!raw.api.tokens.is_empty()).then(|| folder.join(&raw.api.tokens));
         let listen = listen(&raw.api, tokens.is_some(), faults);
+        let tls = tls(&raw.api, folder, faults);
         if !faults.is_empty() {
             return None;
         }
@@ -99,6 +102,7 @@ impl Settings {
             sim,
             listen: listen?,
             tokens,
+            tls,
             raw,
         })
     }
@@ -165,6 +169,25 @@ fn listen(api: &raw::Api, tokens: bool, faults: &mut Faults) -> Option<SocketAdd
         faults.push(("api.listen".into(), message));
     }
     Some(address)
+}
+
+/// Files of certificate and key: both or none.
+fn tls(api: &raw::Api, folder: &Path, faults: &mut Faults) -> Option<(PathBuf, PathBuf)> {
+    let keys = [("api.tls_certificate", &api.tls_certificate), ("api.tls_key", &api.tls_key)];
+    if keys.iter().all(|(_, name)| name.is_empty()) {
+        return None;
+    }
+    for (key, name) in keys {
+        let path = folder.join(name);
+        if name.is_empty() {
+            faults.push((key.into(), "empty; certificate and key are needed together".into()));
+        } else if !path.is_file() {
+            let message =
+                format!("no file at {}; the path is relative to the configuration file", path.display());
+            faults.push((key.into(), message));
+        }
+    }
+    Some((folder.join(&api.tls_certificate), folder.join(&api.tls_key)))
 }
 
 fn polarization(raw: &raw::Projector, faults: &mut Faults) -> Option<Polarization> {

@@ -70,7 +70,8 @@ pub struct Record {
     /// How far the capture is.
     #[serde(default)]
     pub progress: Progress,
-    /// Scans before it, while it is queued.
+    /// Scans before it in the queue, while it is queued; `null` for the one that takes the rig next, which may still be
+    /// opened.
     #[serde(default)]
     pub queue_position: Option<usize>,
     /// Whether it is queued and waits to be released by `POST /v1/queue/resume`.

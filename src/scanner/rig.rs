@@ -75,6 +75,8 @@ pub struct Job {
     pub mode: Mode,
     /// Exposure, where it is not the configured one.
     pub exposure_us: Option<f64>,
+    /// When it was accepted, where it is this process that accepted it.
+    pub accepted: Option<Instant>,
     /// Asks it to stop.
     pub cancel: CancelFlag,
     /// Where its bundle will be.
@@ -338,6 +340,7 @@ impl Open {
         spool(disk::Task::Begin { id: id.clone(), folder: job.spool, manifest, calibration });
         let camera = self.rig.camera.info().serial.clone();
         let period = self.rig.projector.info().refresh_period.as_secs_f64();
+        let clock = self.rig.clock.clone();
         let mut first_flip = None;
         let mut progress = |progress: Progress<'_>| {
             shared.heartbeat.beat();
@@ -348,7 +351,13 @@ impl Open {
                     shared.preview.offer(&frame.frame, &self.prepared.applied);
                     let latency = frame.frame.stamp.received.since(frame.triggered);
                     shared.metrics.trigger_to_frame.observe(latency.as_secs_f64());
-                    let first = *first_flip.get_or_insert(frame.receipt.flipped);
+                    let first = *first_flip.get_or_insert_with(|| {
+                        let ago = clock.now().since(frame.receipt.flipped);
+                        let waited = job.accepted.map(|accepted| accepted.elapsed().saturating_sub(ago));
+                        let after_accepted_ms = waited.map(|waited| 1e3 * waited.as_secs_f64());
+                        tracing::info!(after_accepted_ms, "first pattern shown");
+                        frame.receipt.flipped
+                    });
                     let refreshes = frame.receipt.flipped.since(first).as_secs_f64() / period;
                     shared.metrics.present_phase_error.set((refreshes - refreshes.round()) * period);
                     shared.metrics.frames(&camera, "ok", 1);

@@ -190,9 +190,28 @@ impl Index {
 
     /// Writes what is known of a scan, in place of what was known before.
     pub fn put(&self, record: &Record) -> Result<()> {
+        self.at_once("write a scan", || self.write(record))
+    }
+
+    /// Writes scans that were just accepted, and what their key was used for, all or nothing. Key: its text, what it was
+    /// used for, the time in seconds since 1970.
+    pub fn accept(&self, records: &[Record], key: Option<(&str, &Key, u64)>) -> Result<()> {
+        self.at_once("write new scans", || {
+            records.iter().try_for_each(|record| self.write(record))?;
+            key.map_or(Ok(()), |(key, used, now)| self.set_key(key, used, now))
+        })
+    }
+
+    fn at_once(&self, operation: &'static str, write: impl FnOnce() -> Result<()>) -> Result<()> {
+        let fail = |error| self.fail(operation, error);
+        // Dropped without a commit, it undoes what was written.
+        let transaction = self.connection.unchecked_transaction().map_err(fail)?;
+        write()?;
+        transaction.commit().map_err(fail)
+    }
+
+    fn write(&self, record: &Record) -> Result<()> {
         let text = serde_json::to_string(record).map_err(|error| self.unusable(error.to_string()))?;
-        let transaction =
-            self.connection.unchecked_transaction().map_err(|error| self.fail("write a scan", error))?;
         self.execute(
             "write a scan",
             "INSERT OR REPLACE INTO scans (id, created, state, verdict, mode, label, pinned, source, bytes, record)
@@ -218,7 +237,7 @@ impl Index {
                 [&record.id, tag],
             )?;
         }
-        transaction.commit().map_err(|error| self.fail("write a scan", error))
+        Ok(())
     }
 
     /// One scan.
@@ -401,6 +420,22 @@ mod tests {
         let records: Vec<_> = (0..count).map(|id| record(id, State::ALL[id % State::ALL.len()])).collect();
         records.iter().for_each(|record| index.put(record).unwrap());
         (folder, index, records)
+    }
+
+    #[test]
+    fn scans_and_their_key_are_written_together_or_not_at_all() {
+        let (folder, index, records) = filled(2);
+        let new = [record(7, State::Queued), record(8, State::Queued)];
+        let used = Key { body: "digest".into(), scan: new[0].id.clone() };
+        index.connection.execute_batch("ALTER TABLE keys RENAME TO keys_gone").unwrap();
+        assert!(index.accept(&new, Some(("k", &used, 1))).is_err());
+        assert_eq!(index.ids().unwrap().len(), records.len(), "nothing is left of what failed");
+        index.connection.execute_batch("ALTER TABLE keys_gone RENAME TO keys").unwrap();
+        index.accept(&new, Some(("k", &used, 1))).unwrap();
+        index.accept(&[record(9, State::Queued)], None).unwrap();
+        let other = Index::open_read_only(folder.path()).unwrap();
+        assert_eq!(other.key("k").unwrap(), Some(used));
+        assert_eq!(other.ids().unwrap().len(), records.len() + 3);
     }
 
     #[test]

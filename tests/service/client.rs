@@ -73,6 +73,39 @@ pub fn send(address: SocketAddr, method: &str, path: &str, headers: &[(&str, &st
     Answer { status, headers, body: content }
 }
 
+/// Sends a request to a service that may die meanwhile; nothing where the answer is not whole.
+pub fn try_send(
+    address: SocketAddr,
+    method: &str,
+    path: &str,
+    headers: &[(&str, &str)],
+    body: &[u8],
+) -> Option<Answer> {
+    let mut stream = TcpStream::connect(address).ok()?;
+    stream.set_read_timeout(Some(PATIENCE)).ok()?;
+    let length = body.len();
+    let mut head = format!(
+        "{method} {path} HTTP/1.1\r\nConnection: close\r\nHost: {address}\r\nContent-Length: {length}\r\n"
+    );
+    headers.iter().for_each(|(name, value)| head.push_str(&format!("{name}: {value}\r\n")));
+    head.push_str("\r\n");
+    stream.write_all(head.as_bytes()).and_then(|()| stream.write_all(body)).ok()?;
+    let mut bytes = Vec::new();
+    stream.read_to_end(&mut bytes).ok()?;
+    let end = bytes.windows(4).position(|window| window == b"\r\n\r\n")?;
+    let text = String::from_utf8(bytes[..end].to_vec()).ok()?;
+    let mut lines = text.split("\r\n");
+    let status = lines.next()?.split(' ').nth(1)?.parse().ok()?;
+    let header = |line: &str| {
+        let (name, value) = line.split_once(':')?;
+        Some((name.to_ascii_lowercase(), value.trim().to_owned()))
+    };
+    let headers: BTreeMap<String, String> = lines.filter_map(header).collect();
+    let body = bytes.split_off(end + 4);
+    let whole = headers.get("content-length").and_then(|length| length.parse().ok()) == Some(body.len());
+    whole.then_some(Answer { status, headers, body })
+}
+
 /// Sends a request and leaves the answer to be read.
 pub fn open(
     address: SocketAddr,

@@ -3,13 +3,14 @@
 use std::{
     fs,
     io::{BufRead, BufReader},
-    net::SocketAddr,
+    net::{Ipv4Addr, SocketAddr},
     path::PathBuf,
     process::{Child, Command, ExitStatus, Stdio},
     time::{Duration, Instant},
 };
 
 use serde_json::{Value, json};
+use sha2::{Digest, Sha256};
 
 use crate::{
     client::{Answer, send},
@@ -17,6 +18,11 @@ use crate::{
 };
 
 const JSON: (&str, &str) = ("Content-Type", "application/json");
+
+/// In hexadecimal digits.
+pub fn sha256(bytes: &[u8]) -> String {
+    Sha256::digest(bytes).iter().map(|byte| format!("{byte:02x}")).collect()
+}
 
 /// A configuration, a store, and the process that serves them, which may be started again.
 pub struct Daemon {
@@ -36,11 +42,19 @@ impl Daemon {
 
     /// Not yet started, with its scans somewhere else.
     pub fn in_store(rig: Rig, store: PathBuf) -> Self {
+        Self::listening(rig, store, "127.0.0.1:0")
+    }
+
+    /// Not yet started, with its scans in the rig's folder, on another address.
+    pub fn on_address(rig: Rig, address: &str) -> Self {
+        let store = rig.path("store");
+        Self::listening(rig, store, address)
+    }
+
+    fn listening(rig: Rig, store: PathBuf, address: &str) -> Self {
         // The disk of the tests is whatever it is.
-        let rig = rig
-            .set("store.dir", text(&store))
-            .set("store.min_free_gib", 0.0)
-            .set("api.listen", "127.0.0.1:0");
+        let rig =
+            rig.set("store.dir", text(&store)).set("store.min_free_gib", 0.0).set("api.listen", address);
         Self { rig, store, environment: Vec::new(), child: None, address: None }
     }
 
@@ -82,7 +96,12 @@ impl Daemon {
             let _ = child.wait();
             panic!("{error} in {line:?}; log:\n{}", self.log())
         });
-        self.address = Some(said["address"].as_str().expect("an address").parse().expect("an address"));
+        let mut address: SocketAddr =
+            said["address"].as_str().expect("an address").parse().expect("an address");
+        if address.ip().is_unspecified() {
+            address.set_ip(Ipv4Addr::LOCALHOST.into());
+        }
+        self.address = Some(address);
         self.child = Some(child);
     }
 
@@ -94,6 +113,11 @@ impl Daemon {
     /// Where it listens.
     pub fn address(&self) -> SocketAddr {
         self.address.expect("it was started")
+    }
+
+    /// Its number among the processes of this machine.
+    pub fn process(&self) -> u32 {
+        self.child.as_ref().expect("it runs").id()
     }
 
     /// Ends it in the middle of whatever it does.

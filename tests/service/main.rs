@@ -2,12 +2,16 @@
 
 mod client;
 mod daemon;
+mod kills;
 mod lifecycle;
+mod listing;
 mod recovery;
 mod refusals;
 #[path = "../end_to_end/rig.rs"]
 #[allow(dead_code)] // The other suite needs more of it.
 mod rig;
 mod scans;
+mod soak;
 mod storage;
 mod streams;
+mod tls;

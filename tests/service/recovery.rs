@@ -5,9 +5,8 @@ use std::{fs, time::Duration};
 use serde_json::{Value, json};
 
 use crate::{
-    daemon::Daemon,
+    daemon::{Daemon, sha256},
     rig::{json as json_file, polscan, text},
-    scans::sha256,
 };
 
 /// Deaths in the test below; each takes a second or two.

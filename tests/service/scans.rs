@@ -3,14 +3,11 @@
 use std::io::Cursor;
 
 use serde_json::{Value, json};
-use sha2::{Digest, Sha256};
 
-use crate::{client::send, daemon::Daemon};
-
-/// In hexadecimal digits.
-pub fn sha256(bytes: &[u8]) -> String {
-    Sha256::digest(bytes).iter().map(|byte| format!("{byte:02x}")).collect()
-}
+use crate::{
+    client::send,
+    daemon::{Daemon, sha256},
+};
 
 #[test]
 fn a_scan_is_asked_for_awaited_and_fetched() {
@@ -133,8 +130,6 @@ fn a_busy_rig_names_its_holder_and_a_queue_has_an_end() {
         Daemon::on(crate::rig::Rig::small().set("sim.pacing", "real-time").set("scan.queue_capacity", 2))
             .started();
     let first = daemon.scan(&json!({ "label": "holder" }));
-    // While the rig is first opened, its holder counts as waiting as well.
-    daemon.until(&first, |scan| scan["state"] == "projecting");
     let busy = daemon.post("/v1/scans", &json!({})).expect(409);
     assert_eq!(busy.slug(), "busy");
     assert_eq!(busy.json()["holder"]["id"], first.as_str());
@@ -142,6 +137,11 @@ fn a_busy_rig_names_its_holder_and_a_queue_has_an_end() {
     let second = daemon.scan(&json!({ "queue": true, "mode": "fast" }));
     let third = daemon.scan(&json!({ "queue": true, "mode": "fast" }));
     assert_eq!(daemon.post("/v1/scans", &json!({ "queue": true })).expect(429).slug(), "queue-full");
+    // The rig may still be opened by now: its holder waits for that and for nobody.
+    assert_eq!(daemon.state(&first)["queue_position"], Value::Null);
+    assert_eq!(daemon.state(&second)["queue_position"], 0);
+    assert_eq!(daemon.state(&third)["queue_position"], 1);
+    daemon.until(&first, |scan| scan["state"] == "projecting");
     assert_eq!(daemon.state(&third)["queue_position"], 1);
     // Set-up would disturb the scan.
     assert_eq!(

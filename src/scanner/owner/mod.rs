@@ -115,6 +115,13 @@ pub struct Change {
 /// An answer to whoever asked.
 pub type Reply<T> = oneshot::Sender<Result<T, Denied>>;
 
+/// Gives an answer.
+type Answer = Box<dyn FnOnce()>;
+
+fn answer<T: 'static>(result: Result<T, Denied>, reply: Reply<T>) -> Answer {
+    Box::new(move || drop(reply.send(result)))
+}
+
 /// What comes in.
 #[derive(Debug)]
 pub enum Message {
@@ -275,28 +282,39 @@ impl Owner {
         }
     }
 
+    /// Nobody is answered before everybody can see what the answer says: who asks again at once must not be told what
+    /// was. The rig starts before both: an answer never waits, a pattern might.
     fn handle(&mut self, message: Message) {
-        match message {
-            Message::Submit(submit, reply) => {
-                let answer = self.submit(&submit);
-                // The rig starts before anybody is told: an answer never waits, a pattern might.
-                self.dispatch();
-                self.publish();
-                let _ = reply.send(answer);
-                return;
+        let answer: Option<Answer> = match message {
+            Message::Submit(submit, reply) => Some(answer(self.submit(&submit), reply)),
+            Message::Cancel(id, reply) => Some(answer(self.cancel(&id), reply)),
+            Message::Delete(id, reply) => Some(answer(self.delete(&id), reply)),
+            Message::Change(id, change, reply) => Some(answer(self.change(&id, change), reply)),
+            Message::Hold(held, reply) => Some(answer(Ok(self.hold(held)), reply)),
+            Message::Show(shown, name, reply) => Some(self.show(shown, name, reply)),
+            Message::Preview => {
+                self.preview();
+                None
             }
-            Message::Cancel(id, reply) => drop(reply.send(self.cancel(&id))),
-            Message::Delete(id, reply) => drop(reply.send(self.delete(&id))),
-            Message::Change(id, change, reply) => drop(reply.send(self.change(&id, change))),
-            Message::Hold(held, reply) => drop(reply.send(Ok(self.hold(held)))),
-            Message::Show(shown, name, reply) => self.show(shown, name, reply),
-            Message::Preview => self.preview(),
-            Message::Stop(grace) => self.stop(grace),
-            Message::Rig(news) => self.rig_news(news),
-            Message::Finish(news) => self.finish_news(news),
-        }
+            Message::Stop(grace) => {
+                self.stop(grace);
+                None
+            }
+            Message::Rig(news) => {
+                self.rig_news(news);
+                None
+            }
+            Message::Finish(news) => {
+                self.finish_news(news);
+                None
+            }
+        };
         self.dispatch();
+        self.number_queue();
         self.publish();
+        if let Some(answer) = answer {
+            answer();
+        }
     }
 
     /// Gives the rig its next scan, if it can take one.
@@ -313,6 +331,7 @@ impl Owner {
             label: Label { id: id.clone(), label: record.label.clone(), tags: record.tags.clone() },
             mode: record.mode.parse().unwrap_or(self.settings.mode),
             exposure_us: record.exposure_us,
+            accepted: self.accepted.get(&id).copied(),
             cancel: cancel.clone(),
             bundle: self.library.bundle(&id),
             spool: self.library.spool(&id),
@@ -323,7 +342,6 @@ impl Owner {
         self.rig.state = RigState::Busy;
         self.rig.showing = None;
         self.advance(&id, State::Projecting);
-        self.number_queue();
     }
 
     /// Changes a record without telling anybody yet.
@@ -390,11 +408,20 @@ impl Owner {
         self.event("progress", |_| data.to_string());
     }
 
+    /// The scan that takes the rig as soon as it can, where none has it: while the rig is opened, say.
+    fn next_holder(&self) -> Option<&Waiting> {
+        self.queue.iter().find(|waiting| !waiting.held).filter(|_| self.active.is_none())
+    }
+
+    /// Gives those that wait their places, behind whoever has the rig or takes it next.
     fn number_queue(&mut self) {
+        let holder = self.next_holder().map(|waiting| waiting.id.clone());
         let order: Vec<String> = self.queue.iter().map(|waiting| waiting.id.clone()).collect();
-        for (position, id) in order.iter().enumerate() {
-            if self.scans.get(id).is_some_and(|record| record.queue_position != Some(position)) {
-                self.edit(id, |record| record.queue_position = Some(position));
+        let others = order.iter().filter(|id| holder.as_ref() != Some(id));
+        let places = others.enumerate().map(|(place, id)| (id, Some(place)));
+        for (id, place) in places.chain(holder.iter().map(|id| (id, None))) {
+            if self.scans.get(id).is_some_and(|record| record.queue_position != place) {
+                self.edit(id, |record| record.queue_position = place);
             }
         }
         self.out.metrics.queue_depth.set(order.len() as i64);

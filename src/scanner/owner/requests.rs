@@ -22,15 +22,11 @@ impl Owner {
         };
         let records = self.records(submit, source.as_deref());
         let first = records[0].id.clone();
-        let stored = records.iter().try_for_each(|record| self.index.put(record)).and_then(|()| {
-            let Some((key, body)) = &submit.key else { return Ok(()) };
-            let used = Key { body: body.clone(), scan: first.clone() };
-            self.index.set_key(key, &used, seconds_since_1970())
-        });
-        if let Err(error) = stored {
-            records.iter().for_each(|record| drop(self.index.remove(&record.id)));
-            return Err(Denied::Storage(chain(&error)));
-        }
+        let used =
+            submit.key.as_ref().map(|(key, body)| (key.as_str(), Key { body: body.clone(), scan: first }));
+        let key = used.as_ref().map(|(key, used)| (*key, used, seconds_since_1970()));
+        // Scans and key at once: a client that asks again after a crash gets what was begun, or nothing had begun.
+        self.index.accept(&records, key).map_err(|error| Denied::Storage(chain(&error)))?;
         for record in records.iter().cloned() {
             let id = record.id.clone();
             self.accepted.insert(id.clone(), Instant::now());
@@ -118,15 +114,16 @@ impl Owner {
     }
 
     pub(super) fn situation(&self) -> Situation {
-        let next = self.queue.iter().find(|waiting| !waiting.held).map(|waiting| waiting.id.as_str());
+        let next = self.next_holder().map(|waiting| waiting.id.as_str());
         let holder = self.active.as_deref().or(next).and_then(|id| self.holder(id));
+        let runnable = self.queue.iter().filter(|waiting| !waiting.held).count();
         Situation {
             obstacles: self.obstacles(),
             holder,
             finishing: self.finishing.len(),
             oldest_finishing: self.finishing.front().and_then(|id| self.holder(id)),
             // Who only waits for the rig to be opened takes no place of those that wait for others.
-            runnable: self.queue.iter().filter(|waiting| !waiting.held && !waiting.urgent).count(),
+            runnable: runnable - usize::from(next.is_some()),
             held: self.queue.iter().filter(|waiting| waiting.held).count(),
             capacity: self.settings.raw.scan.queue_capacity,
         }
@@ -278,33 +275,34 @@ impl Owner {
         ids.len()
     }
 
-    pub(super) fn show(&mut self, shown: Shown, name: String, reply: Reply<()>) {
+    pub(super) fn show(&mut self, shown: Shown, name: String, reply: Reply<()>) -> Answer {
         let situation = self.situation();
         if let Some(obstacle) = situation.obstacles.iter().find(|one| one.kind != "storage") {
-            let _ = reply.send(Err(Denied::Refused(Refusal::NotReady(vec![obstacle.clone()]))));
-        } else if let Some(holder) = situation.holder {
-            let _ = reply.send(Err(Denied::Refused(Refusal::Busy(holder))));
-        } else {
-            self.rig.showing = (name != "black").then_some(name);
-            let (sender, receiver) = oneshot::channel::<Result<(), Failure>>();
-            let _ = self.out.rig.send(rig::Command::Show(shown, sender));
-            // The owner must not wait for a device; a thread of a moment may.
-            let answer = move || {
-                let answer = match receiver.blocking_recv() {
-                    Ok(Ok(())) => Ok(()),
-                    Ok(Err(failure)) => Err(Denied::Rig(failure.chain())),
-                    Err(_) => Err(Denied::Rig("the rig went away".to_owned())),
-                };
-                let _ = reply.send(answer);
+            return answer(Err(Denied::Refused(Refusal::NotReady(vec![obstacle.clone()]))), reply);
+        }
+        if let Some(holder) = situation.holder {
+            return answer(Err(Denied::Refused(Refusal::Busy(holder))), reply);
+        }
+        self.rig.showing = (name != "black").then_some(name);
+        let showing = self.rig.showing.clone();
+        self.event("projector", |_| serde_json::json!({ "show": showing }).to_string());
+        let (sender, receiver) = oneshot::channel::<Result<(), Failure>>();
+        let rig = self.out.rig.clone();
+        // The owner must not wait for a device; a thread of a moment may.
+        let wait = move || {
+            let shown = match receiver.blocking_recv() {
+                Ok(Ok(())) => Ok(()),
+                Ok(Err(failure)) => Err(Denied::Rig(failure.chain())),
+                Err(_) => Err(Denied::Rig("the rig went away".to_owned())),
             };
-            if let Err(error) = std::thread::Builder::new().name("show".to_owned()).spawn(answer) {
+            let _ = reply.send(shown);
+        };
+        Box::new(move || {
+            let _ = rig.send(rig::Command::Show(shown, sender));
+            if let Err(error) = std::thread::Builder::new().name("show".to_owned()).spawn(wait) {
                 tracing::warn!(%error, "no thread for an answer");
             }
-            self.event("projector", {
-                let showing = self.rig.showing.clone();
-                move |_| serde_json::json!({ "show": showing }).to_string()
-            });
-        }
+        })
     }
 
     pub(super) fn preview(&mut self) {
