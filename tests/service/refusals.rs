@@ -8,6 +8,12 @@ use crate::{
     rig::{Rig, polscan, text},
 };
 
+/// What clients do wrong is no fault of the service.
+fn nothing_at_error_level(daemon: &Daemon) {
+    let log = daemon.log();
+    assert!(log.contains("\"INFO\"") && !log.contains("\"ERROR\""), "{log}");
+}
+
 const TYPED: (&str, &str) = ("Content-Type", "application/json");
 
 #[test]
@@ -49,6 +55,7 @@ fn wrong_requests_get_problems_that_say_what_is_wrong() {
     daemon.post("/v1/calibrations/odd", &json!({})).expect(404);
     // Nothing of all this was a scan.
     assert!(daemon.get("/v1/scans").json()["scans"].as_array().unwrap().is_empty());
+    nothing_at_error_level(&daemon);
 }
 
 #[test]
@@ -90,6 +97,7 @@ fn no_path_leads_out_of_a_bundle() {
         assert!([400, 404, 405].contains(&status), "{id}: {status}");
     }
     assert!(daemon.store.join("secret").is_file() && daemon.store.join("index.sqlite").is_file());
+    nothing_at_error_level(&daemon);
 }
 
 #[test]
@@ -108,6 +116,7 @@ fn pages_of_others_cannot_use_this_machine() {
     // No page of another origin may read an answer.
     let answer = post(&[("Origin", "http://localhost:1")]).expect(202);
     assert_eq!(answer.header("access-control-allow-origin"), "");
+    nothing_at_error_level(&daemon);
 }
 
 #[test]
@@ -144,6 +153,7 @@ fn another_address_needs_tokens_and_tokens_have_scopes() {
         let secret = token.trim_start_matches("Bearer polscan_");
         assert!(!daemon.log().contains(secret) && !config.contains(secret));
     }
+    nothing_at_error_level(&daemon);
 }
 
 #[test]

@@ -254,6 +254,23 @@ fn a_key_makes_a_request_happen_once_over_restarts_as_well() {
 }
 
 #[test]
+fn one_key_of_many_clients_at_once_is_one_scan() {
+    let daemon = Daemon::real_time();
+    daemon.ready();
+    let post = || {
+        let headers = [("Content-Type", "application/json"), ("Idempotency-Key", "k")];
+        let answer = send(daemon.address(), "POST", "/v1/scans", &headers, b"{\"mode\":\"fast\"}");
+        answer.expect(202).header("location").to_owned()
+    };
+    let locations: Vec<String> = std::thread::scope(|scope| {
+        let clients: Vec<_> = (0..8).map(|_| scope.spawn(post)).collect();
+        clients.into_iter().map(|client| client.join().unwrap()).collect()
+    });
+    assert!(locations.iter().all(|location| *location == locations[0]), "{locations:?}");
+    assert_eq!(daemon.get("/v1/scans").json()["scans"].as_array().unwrap().len(), 1);
+}
+
+#[test]
 fn of_two_clients_at_once_one_gets_the_rig() {
     let daemon = Daemon::real_time();
     daemon.ready();

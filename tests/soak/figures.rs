@@ -38,21 +38,18 @@ fn say(name: &str, mut values: Vec<f64>) -> Vec<f64> {
     values
 }
 
-/// Measured on this machine, which is described first.
-#[test]
-fn figures() {
+/// On what a figure was measured.
+fn describe(when: &str) {
     let cores = std::thread::available_parallelism().map_or(0, usize::from);
     let load = std::fs::read_to_string("/proc/loadavg").unwrap_or_default();
     let build = if cfg!(debug_assertions) { "development build" } else { "release build" };
-    println!("{cores} cores, load before {}, {build}", load.trim());
-    first_pattern();
-    overhead();
-    answers_while_decoding();
-    println!("load after {}", std::fs::read_to_string("/proc/loadavg").unwrap_or_default().trim());
+    println!("{cores} cores, {build}, load {when} {}", load.trim());
 }
 
 /// From before the request is sent until light is on the object: an upper bound, as the answer's way back is counted in.
-fn first_pattern() {
+#[test]
+fn figures_of_the_first_pattern() {
+    describe("before");
     let daemon = Daemon::real_time();
     daemon.ready();
     // The first scan sets the mode; the prepared one after it is what a bench sees.
@@ -76,11 +73,14 @@ fn first_pattern() {
     say("request until its answer", asked.iter().map(|asked| ms(*asked)).collect());
     say("accepted until the first pattern is shown", shown);
     say("request until the first pattern is shown, at most", sum);
+    describe("after");
 }
 
 /// The same scan by the service and by `polscan scan`, in turn. The rig is open in a service, so that the program's
 /// own start is measured apart, by a command that only opens the rig.
-fn overhead() {
+#[test]
+fn figures_of_the_overhead() {
+    describe("before");
     let rig = || Rig::scaled(2.0).set("sim.pacing", "real-time");
     let command = rig();
     let daemon = Daemon::on(rig()).started();
@@ -105,10 +105,13 @@ fn overhead() {
     let [served, run, opened] = [served, run, opened].map(|values| quantile(&values, 0.5));
     println!("service over `polscan scan`, medians: {:+.1} %", 100.0 * (served / run - 1.0));
     println!("without the start of the program: {:+.1} %", 100.0 * (served / (run - opened) - 1.0));
+    describe("after");
 }
 
 /// `/livez` as often as one client can ask, with scans of the whole rig decoded one after the other.
-fn answers_while_decoding() {
+#[test]
+fn figures_of_answers_while_it_decodes() {
+    describe("before");
     let daemon = Daemon::on(Rig::scaled(1.0)).started();
     daemon.ready();
     let source = daemon.finished_scan();
@@ -134,6 +137,7 @@ fn answers_while_decoding() {
         over.store(true, Ordering::Relaxed);
         prober.join().expect("a prober")
     });
+    describe("after");
     let times = say("/livez while scans of the whole rig are decoded on all cores", times);
     assert!(quantile(&times, 0.99) < 50.0, "the service does not answer while it decodes");
 }
