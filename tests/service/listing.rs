@@ -51,13 +51,14 @@ pub fn page_through(count: usize) -> Paging {
     daemon.start();
     let start = begun.elapsed();
     let mut pages = Vec::new();
-    let filters: [(&str, &dyn Fn(&Record) -> bool); 6] = [
-        ("", &|_| true),
-        ("&limit=500", &|_| true),
-        ("&limit=100&state=cancelled,interrupted", &|one| one.state != State::Failed),
-        ("&limit=100&label=part%207", &|one| one.label.as_deref() == Some("part 7")),
-        ("&limit=100&tag=bench,batch-3", &|one| one.tags.iter().any(|tag| tag == "batch-3")),
-        ("&limit=100&mode=fast&verdict=ok", &|_| false),
+    type Belongs = fn(&Record) -> bool;
+    let filters: [(&str, Belongs); 6] = [
+        ("", |_| true),
+        ("&limit=500", |_| true),
+        ("&limit=100&state=cancelled,interrupted", |one| one.state != State::Failed),
+        ("&limit=100&label=part%207", |one| one.label.as_deref() == Some("part 7")),
+        ("&limit=100&tag=bench,batch-3", |one| one.tags.iter().any(|tag| tag == "batch-3")),
+        ("&limit=100&mode=fast&verdict=ok", |_| false),
     ];
     for (filter, belongs) in filters {
         let wanted: Vec<&str> =

@@ -4,6 +4,7 @@ mod client;
 mod daemon;
 mod kills;
 mod lifecycle;
+#[allow(dead_code)] // The long runs print what is measured here.
 mod listing;
 mod recovery;
 mod refusals;
@@ -11,6 +12,7 @@ mod refusals;
 #[allow(dead_code)] // The other suite needs more of it.
 mod rig;
 mod scans;
+#[allow(dead_code)]
 mod soak;
 mod storage;
 mod streams;

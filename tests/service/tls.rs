@@ -24,9 +24,10 @@ use crate::{
 
 /// Writes a new certificate and its key, and answers the certificate.
 fn renew(rig: &Rig) -> CertificateDer<'static> {
-    let made = rcgen::generate_simple_self_signed(vec!["localhost".to_owned()]).unwrap();
-    fs::write(rig.path("certificate.pem"), made.cert.pem()).unwrap();
-    fs::write(rig.path("key.pem"), made.signing_key.serialize_pem()).unwrap();
+    let made =
+        rcgen::generate_simple_self_signed(vec!["localhost".to_owned()]).expect("a certificate of our own");
+    fs::write(rig.path("certificate.pem"), made.cert.pem()).expect("a certificate of our own");
+    fs::write(rig.path("key.pem"), made.signing_key.serialize_pem()).expect("a certificate of our own");
     made.cert.der().clone()
 }
 
