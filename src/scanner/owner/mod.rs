@@ -408,25 +408,6 @@ impl Owner {
         self.event("progress", |_| data.to_string());
     }
 
-    /// The scan that takes the rig as soon as it can, where none has it: while the rig is opened, say.
-    fn next_holder(&self) -> Option<&Waiting> {
-        self.queue.iter().find(|waiting| !waiting.held).filter(|_| self.active.is_none())
-    }
-
-    /// Gives those that wait their places, behind whoever has the rig or takes it next.
-    fn number_queue(&mut self) {
-        let holder = self.next_holder().map(|waiting| waiting.id.clone());
-        let order: Vec<String> = self.queue.iter().map(|waiting| waiting.id.clone()).collect();
-        let others = order.iter().filter(|id| holder.as_ref() != Some(id));
-        let places = others.enumerate().map(|(place, id)| (id, Some(place)));
-        for (id, place) in places.chain(holder.iter().map(|id| (id, None))) {
-            if self.scans.get(id).is_some_and(|record| record.queue_position != place) {
-                self.edit(id, |record| record.queue_position = place);
-            }
-        }
-        self.out.metrics.queue_depth.set(order.len() as i64);
-    }
-
     fn rig_event(&mut self) {
         let data = serde_json::json!({ "state": self.rig.state, "message": self.rig.message });
         self.event("rig", |_| data.to_string());
