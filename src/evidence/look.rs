@@ -68,6 +68,8 @@ pub struct Frames<'a> {
     pub decoded: &'a Decoded,
     /// Whether the last references can be relied on as well as the first.
     pub last_references: bool,
+    /// Whether the camera adjusted its exposure to the pictures: then frames may differ by any factor.
+    pub adjusts: bool,
 }
 
 /// What a closer look at one pair shows.
@@ -96,6 +98,8 @@ pub struct Look {
     pub one_sided: f64,
     /// First image row below a tear.
     pub torn_at: Option<usize>,
+    /// Whether a change of any size may be one of brightness.
+    any_change: bool,
     /// Whether each pixel looked at is an unexplained outlier; the same pixels for all pairs, `None` where not judged.
     marks: Vec<Option<bool>>,
 }
@@ -114,7 +118,7 @@ impl Look {
     }
 
     fn is_sensible(&self) -> bool {
-        (LARGEST_CHANGE[0]..LARGEST_CHANGE[1]).contains(&self.change)
+        self.any_change || (LARGEST_CHANGE[0]..LARGEST_CHANGE[1]).contains(&self.change)
     }
 
     /// How far the outliers of this pair and of `other` are the same pixels: 1 where all are, 0 where as many are as
@@ -205,7 +209,8 @@ impl<'a> Frames<'a> {
         if matches!(&expected, Expected::Pairs(pairs) if pairs.len() < LEAST_PAIRS) {
             return None;
         }
-        self.sampler(pair, expected, flat_only).look()
+        let look = self.sampler(pair, expected, flat_only).look()?;
+        Some(Look { any_change: self.adjusts, ..look })
     }
 
     /// Residual of a pair in units of its noise, positive, at every pixel; NaN where it says nothing.
@@ -454,6 +459,7 @@ impl Sampler<'_> {
             strength_spread,
             one_sided,
             torn_at: tear(&by_row).map(|row| rows[row]),
+            any_change: false,
             marks,
         })
     }

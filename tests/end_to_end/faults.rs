@@ -56,10 +56,27 @@ fn the_calibration_of_another_pose_is_a_row_mismatch() {
     assert!(reasons(&report).contains(&"row-mismatch"), "{}", report["reasons"]);
 }
 
-/// One scan of each fault at a quarter of the size; `make faults` makes many.
+/// Faults of the suite: one for each way in which frames, display, light, optics and scene go wrong.
+const FEW: [&str; 11] = [
+    "dropped frame",
+    "stale frame",
+    "torn frame",
+    "dead sensor row",
+    "P and Q exchanged",
+    "sequence late by a pair",
+    "lamp flickers by 10 %",
+    "automatic exposure",
+    "room light switched on",
+    "object bumped",
+    "polarizer turned by 15 to 35 degrees",
+];
+
+/// One scan of some faults at a quarter of the size; `make faults` makes many of all.
 #[test]
-fn each_fault_is_named_and_its_own_bundle_says_the_same() {
-    for case in cases::all() {
+fn faults_are_named_and_their_own_bundles_say_the_same() {
+    let cases: Vec<_> = cases::all().into_iter().filter(|case| FEW.contains(&case.name)).collect();
+    assert_eq!(cases.len(), FEW.len(), "a fault has another name");
+    for case in cases {
         let rig = (case.build)(Rig::small(), &mut Random::new(1, 4.0));
         let mode: Vec<&str> = case.mode.map(|mode| vec!["--mode", mode]).unwrap_or_default();
         let run = rig.scan("scan", &mode);
@@ -75,9 +92,7 @@ fn each_fault_is_named_and_its_own_bundle_says_the_same() {
             "ok" => found.is_empty(),
             name => found.contains(&name) || again.iter().any(|reason| reason == name),
         };
-        // Known to be confused at this size: an exposure that follows the pictures looks like a lamp that flickers.
-        let confused = case.name == "automatic exposure" && said(&"flicker");
-        let named = case.live.iter().any(said) || confused;
+        let named = case.live.iter().any(said);
         assert!(named, "{}: {found:?}, taken again for {again:?}", case.name);
         let wrong = report["truth"]["wrong_code_rate"].as_f64().unwrap_or(0.0);
         assert!(report["verdict"] != "ok" || wrong < 1e-3, "{}: {wrong} wrong and called ok", case.name);

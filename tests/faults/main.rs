@@ -12,7 +12,14 @@ mod recorder;
 #[allow(dead_code)]
 mod rig;
 
-use std::{collections::BTreeMap, env, fmt::Write as _, fs};
+use std::{
+    collections::BTreeMap,
+    env,
+    fmt::Write as _,
+    fs,
+    sync::atomic::{AtomicU64, Ordering},
+    thread,
+};
 
 use cases::{Case, Random};
 use rig::Rig;
@@ -45,18 +52,17 @@ struct Tally {
 
 #[test]
 fn every_fault_is_named_and_none_ends_in_a_wrong_cloud_called_ok() {
-    let number = |name: &str, default: u64| {
+    let number = |name: &str, default: f64| {
         env::var(name).map_or(default, |text| text.parse().unwrap_or_else(|_| panic!("{name}: a number")))
     };
-    let seeds = number("POLSCAN_FAULTS_SEEDS", 20);
-    let scale = number("POLSCAN_FAULTS_SCALE", 2) as f64;
+    let seeds = number("POLSCAN_FAULTS_SEEDS", 20.0) as u64;
+    let scale = number("POLSCAN_FAULTS_SCALE", 2.0);
     let only = env::var("POLSCAN_FAULTS_ONLY").unwrap_or_default();
     let mut rows = Vec::new();
     let cases = cases::all();
     for case in cases.iter().filter(|case| case.name.contains(&only)) {
         let mut tallies = [Tally::default(), Tally::default()];
-        for seed in 1..=seeds {
-            let [live, alone] = run(case, seed, scale);
+        for (seed, [live, alone]) in (1..).zip(run_all(case, seeds, scale)) {
             for (way, (tally, found)) in ["live", "alone"].iter().zip(tallies.iter_mut().zip([live, alone])) {
                 let Some(found) = found else { continue };
                 let expected = if *way == "live" { case.live } else { case.alone };
@@ -87,6 +93,28 @@ fn every_fault_is_named_and_none_ends_in_a_wrong_cloud_called_ok() {
         }
     }
     assert!(failures.is_empty(), "{}", failures.join("\n"));
+}
+
+/// All seeds of a fault, as many at once as the machine has processors.
+fn run_all(case: &Case, seeds: u64, scale: f64) -> Vec<[Option<Found>; 2]> {
+    let next = AtomicU64::new(1);
+    let work = || {
+        let mut done = Vec::new();
+        loop {
+            let seed = next.fetch_add(1, Ordering::Relaxed);
+            if seed > seeds {
+                return done;
+            }
+            done.push((seed, run(case, seed, scale)));
+        }
+    };
+    let workers = thread::available_parallelism().map_or(1, usize::from);
+    let mut done: Vec<_> = thread::scope(|scope| {
+        let running: Vec<_> = (0..workers).map(|_| scope.spawn(work)).collect();
+        running.into_iter().flat_map(|worker| worker.join().expect("no scan panics")).collect()
+    });
+    done.sort_by_key(|(seed, _)| *seed);
+    done.into_iter().map(|(_, found)| found).collect()
 }
 
 fn run(case: &Case, seed: u64, scale: f64) -> [Option<Found>; 2] {

@@ -13,7 +13,7 @@ use serde_json::{Value, json};
 use super::{Diagnosis, Reason};
 use crate::{
     decode::{Decoded, PairResidual},
-    evidence::{Cause, EDGE_OUTLIERS, FLAT_OUTLIERS, Frames, Look},
+    evidence::{Cause, EDGE_OUTLIERS, FLAT_OUTLIERS, Frames, Look, STALE_SHARE, WHOLE_FRAME},
     report::statistics,
 };
 
@@ -159,7 +159,13 @@ pub fn diagnose(decoded: &Decoded, frames: Option<Frames>) -> Vec<Reason> {
     if coarse.is_empty() {
         coarse.clone_from(&views);
     }
-    let Sorted { sound, mut shifted, disturbed } = sort(&coarse, frames, !decoded.noise_estimated);
+    let Sorted { sound, mut shifted, mut disturbed } = sort(&coarse, frames, !decoded.noise_estimated);
+    if frames.is_some_and(|frames| frames.adjusts) {
+        // Where both references were exposed otherwise than the pairs, dark pixels keep a rest that no gain of the pair
+        // explains; another picture is off on a large part of the image, whatever the exposure.
+        disturbed
+            .retain(|case| case.share() >= WHOLE_FRAME && case.strength().is_some_and(|s| s >= STALE_SHARE));
+    }
 
     let mut lone_fine = lone(&fine).map(|view| {
         let look = frames.and_then(|frames| frames.look(view.pair.axis, view.pair.bit, false));
@@ -193,6 +199,11 @@ pub fn diagnose(decoded: &Decoded, frames: Option<Frames>) -> Vec<Reason> {
         }
     }
     reasons
+}
+
+/// Whether the camera adjusted its exposure to the pictures.
+pub(super) fn adjusts(decoded: &Decoded, frames: Frames) -> bool {
+    light::is_automatic(decoded, frames)
 }
 
 fn views(pairs: &[PairResidual]) -> Vec<View<'_>> {

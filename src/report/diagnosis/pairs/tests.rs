@@ -334,6 +334,40 @@ fn a_frame_of_another_brightness_is_flicker() {
 }
 
 #[test]
+fn an_exposure_that_answers_to_the_pictures_is_automatic() {
+    for (target, speed) in [(0.25, 0.5), (0.25, 0.1), (0.15, 0.3)] {
+        let adjusting = |scan: &mut Scan| {
+            let (black, mut exposure) = (scan.rig.black_dn, 1.0);
+            for at in 0..scan.frames.len() {
+                scan.scale(at, exposure, ALL);
+                let frame = &scan.frames[at].1;
+                let sum: f64 = frame.iter().map(|&dn| f64::from(dn) - black).sum();
+                let mean = (sum / frame.len() as f64).max(1.0);
+                exposure *= (target * 4095.0 / mean).powf(speed);
+            }
+        };
+        let found = scanned(Mode::Pse, adjusting);
+        assert_eq!(found.first(), Some(&(Diagnosis::ExposureDrift, DEGRADED)), "{target} {speed}: {found:?}");
+        let names: Vec<_> = found.iter().map(|(name, _)| *name).collect();
+        assert!(!names.contains(&Diagnosis::Flicker) && !names.contains(&Diagnosis::StaleFrame), "{names:?}");
+    }
+}
+
+#[test]
+fn a_lamp_that_beats_at_any_rate_is_not_automatic_exposure() {
+    for step in 1..16 {
+        let angle = std::f64::consts::PI * f64::from(step) / 16.0;
+        let mut scan = Scan::new(Mode::Pse);
+        for at in 0..scan.frames.len() {
+            scan.scale(at, 1.0 + 0.08 * (angle * at as f64 + 0.4).sin(), ALL);
+        }
+        for reason in scan.report().reasons {
+            assert_ne!(reason.evidence["follows_the_frame_before"], json!(true), "{angle}");
+        }
+    }
+}
+
+#[test]
 fn light_that_fades_is_drift_of_the_lamp_or_of_the_room() {
     let lamp = |scan: &mut Scan| {
         let count = scan.frames.len();
