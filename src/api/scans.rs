@@ -302,7 +302,7 @@ pub struct Empty {}
     post, path = "/v1/scans/{id}/reprocess", tag = "scans", params(("id" = String, Path), WaitParams,
         ("Idempotency-Key" = Option<String>, Header, description = "Key of the request, such as a UUID; may be quoted",
             pattern = r#"^"?[!#-~]([ -~]{0,252}[!#-~])?"?$"#)),
-    request_body = ReprocessRequest,
+    request_body = Option<ReprocessRequest>,
     responses(
         (status = 202, description = "Accepted", body = Scan, headers(("Location" = String, description = "Address of the new scan"))),
         (status = 404, description = "Unknown", body = ProblemBody, content_type = "application/problem+json"),

@@ -42,7 +42,7 @@ class Service:
     def __init__(self, binary, folder, changes=()):
         self.folder = Path(folder)
         changes = [("store.dir", json.dumps(str(self.folder / "store"))), ("store.min_free_gib", "0.0"),
-                   ("store.quota_gib", "0.5"), ("store.delete_oldest", "true"), ("scan.queue_capacity", "2"),
+                   ("store.quota_gib", "6.0"), ("scan.queue_capacity", "2"),
                    ("api.wait_limit_s", "2.0"), ("api.listen", '"127.0.0.1:0"'), *changes]
         self.config = small_twin.write(self.folder, 8.0, changes)
         self.log = (self.folder / "log").open("wb")

@@ -51,7 +51,9 @@ class Container:
     def __init__(self, root, shared):
         self.log = open(shared / "console", "wb")
         command = ["systemd-nspawn", "--quiet", "-D", root, "--boot", "--volatile=overlay", "--register=no", "--keep-unit",
-                   "--private-network", "--machine=polscan-test", "--console=pipe", f"--bind-ro={shared}:/shared"]
+                   "--private-network", "--machine=polscan-test", "--console=pipe", f"--bind-ro={shared}:/shared",
+                   # The systemd inside filters addresses by programs of the kernel.
+                   "--capability=CAP_BPF", "--system-call-filter=bpf"]
         # The unified hierarchy is what filters of addresses and devices need; a machine may have it beside the old ones.
         environment = {**os.environ, "SYSTEMD_NSPAWN_UNIFIED_HIERARCHY": "1"}
         self.process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=self.log, stderr=self.log, env=environment)
@@ -136,11 +138,12 @@ def install(box, shared):
 def readiness(box):
     print("start:")
     start = time.monotonic()
-    box.shell("systemctl start polscan")
+    # Enabled, so that systemd keeps in mind how it ended.
+    box.shell("systemctl enable --quiet --now polscan")
     took = time.monotonic() - start
     status, _ = box.ask("GET", "/livez")
     # `start` of a unit of type notify returns with READY=1 and not before.
-    check(status == 200, "the interface answers as soon as systemctl start returns", f"{took:.1f} s")
+    check(status == 200, "the interface answers as soon as systemctl enable --now returns", f"{took:.1f} s")
     check(box.show("Type", "ActiveState", "SubState") == ["notify", "active", "running"], "the unit is active")
     check(box.show("Environment") == "", "the unit sets no variable, so that no rig hangs on demand")
     box.ready()
@@ -265,9 +268,9 @@ def stops(box):
     took, unit, state = stop_while_scanning(box, {"mode": "pse", "exposure_us": 2e6})
     check(unit == ended and took < 45, "a stop during a scan that is too long ends with exit status 0, in time",
           f"{'/'.join(unit)}, {took:.1f} s of 45")
-    check(state == "cancelled", "that scan was cancelled, which puts the projector to black", state)
+    check(state == "interrupted", "that scan was cut short, and says so", state)
     box.ready()
-    check("SIGKILL" not in box.journal("-b").split("too-long")[-1].split("Stopping")[-1], "nothing had to be killed")
+    check("State 'stop-sigterm' timed out" not in box.journal(), "nothing had to be killed")
 
 
 def logs(box, first):
