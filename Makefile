@@ -37,7 +37,7 @@ api-fuzz: ## ask a live service what its API document allows and what it does no
 	@scripts/install test
 	@scripts/api-fuzz
 
-systemd: ## as root: the package, installed in a container with a systemd of its own, about 3 minutes
+systemd: ## as root: the package, installed in a container with a systemd of its own, and a full disk; about 3 minutes
 	@scripts/install systemd
 	@scripts/systemd-test
 

@@ -54,7 +54,9 @@ pub fn complete(mut document: Whole) -> Whole {
     }
     let bearer = HttpBuilder::new()
         .scheme(HttpAuthScheme::Bearer)
-        .description(Some("Needed where the service has tokens; without them only its own machine is served."))
+        .description(Some(
+            "Needed where the service has tokens; without them only its own machine is served.",
+        ))
         .build();
     let components = document.components.get_or_insert_default();
     components.security_schemes.insert(BEARER.to_owned(), SecurityScheme::Http(bearer));
@@ -70,7 +72,11 @@ fn complete_operation(path: &str, method: &HttpMethod, operation: &mut Operation
         add(operation, "401", "There are tokens, and none of them came along");
         add(operation, "503", "Too many requests at once");
     }
-    add(operation, "403", "The token does not reach so far, or the request comes from a page of somebody else's");
+    add(
+        operation,
+        "403",
+        "The token does not reach so far, or the request comes from a page of somebody else's",
+    );
     let takes_query = operation
         .parameters
         .iter()

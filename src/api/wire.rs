@@ -36,7 +36,8 @@ fn whole<'de, D: serde::Deserializer<'de>>(input: D) -> Result<Option<usize>, D:
     let count = |number: serde_json::Number| {
         let exact = number.as_u64().or_else(|| {
             // Beyond 2^53 neighbours of a float are not whole numbers any more; nobody counts that far.
-            let float = number.as_f64().filter(|float| float.fract() == 0.0 && (0.0..=9e15).contains(float))?;
+            let float =
+                number.as_f64().filter(|float| float.fract() == 0.0 && (0.0..=9e15).contains(float))?;
             Some(float as u64)
         });
         let count = exact.and_then(|exact| usize::try_from(exact).ok());
@@ -130,7 +131,9 @@ impl Scan {
 #[serde(deny_unknown_fields, default)]
 pub struct ListParams {
     /// States, separated by commas.
-    #[param(pattern = "^((queued|projecting|acquired|decoding|done|failed|cancelled|interrupted)?,)*(queued|projecting|acquired|decoding|done|failed|cancelled|interrupted)?$")]
+    #[param(
+        pattern = "^((queued|projecting|acquired|decoding|done|failed|cancelled|interrupted)?,)*(queued|projecting|acquired|decoding|done|failed|cancelled|interrupted)?$"
+    )]
     pub state: Option<String>,
     /// `ok`, `degraded` or `failed`.
     pub verdict: Option<String>,
