@@ -1,5 +1,5 @@
 # Two commands are all that is needed: `make run` and `make test`. Both install what is missing first.
-.PHONY: run serve test captures foreign-plane faults soak kills service-figures fuzz accuracy setup install ci
+.PHONY: run serve test captures foreign-plane faults soak kills service-figures fuzz accuracy api-fuzz systemd deb setup install ci
 
 run: ## build, serve the simulated rig, scan it over REST, say where the results are
 	@scripts/install build
@@ -44,6 +44,18 @@ fuzz: ## every parser with damaged input, 15 minutes each; scripts/fuzz SECONDS 
 accuracy: ## measure the scanner on the simulated rig, about 5 minutes; writes docs/accuracy.md and its plots
 	@scripts/install build
 	cargo run --locked --profile test --example accuracy
+
+api-fuzz: ## ask a live service what its API document allows and what it does not, about 3 minutes
+	@scripts/install test
+	@scripts/api-fuzz
+
+systemd: ## as root: the package, installed in a container with a systemd of its own; about 3 minutes
+	@scripts/install systemd
+	@scripts/systemd-test
+
+deb: ## the Debian package, in target/debian
+	@scripts/install build
+	@scripts/deb
 
 setup: ## system packages and the Python environment of the checks
 	@scripts/install test

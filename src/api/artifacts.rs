@@ -236,8 +236,12 @@ async fn serve(app: &App, id: &str, name: &str, headers: &HeaderMap) -> Result<R
     get, path = "/v1/scans/{id}/{name}", tag = "artifacts",
     params(("id" = String, Path), ("name" = String, Path, description = "Name of the file")),
     responses(
-        (status = 200, description = "The file", content_type = "application/octet-stream", body = [u8]),
-        (status = 206, description = "A part of it", content_type = "application/octet-stream", body = [u8]),
+        (status = 200, description = "The file", content(
+            ([u8] = "application/octet-stream"), (Object = "application/json"), (String = "application/toml"),
+            ([u8] = "application/zip"), ([u8] = "image/png"))),
+        (status = 206, description = "A part of it", content(
+            ([u8] = "application/octet-stream"), (Object = "application/json"), (String = "application/toml"),
+            ([u8] = "application/zip"), ([u8] = "image/png"))),
         (status = 304, description = "The client has it"),
         (status = 404, description = "Unknown scan, or it has no such file", body = ProblemBody, content_type = "application/problem+json"),
         (status = 409, description = "Not yet", body = ProblemBody, content_type = "application/problem+json"),

@@ -3,6 +3,7 @@
 
 mod artifacts;
 mod auth;
+mod document;
 mod extract;
 mod live;
 mod pages;
@@ -130,24 +131,8 @@ impl App {
     }
 }
 
-#[derive(OpenApi)]
-#[openapi(
-    info(
-        title = "polscan",
-        description = "A structured-light scanner for objects too shiny and too black for others: ask for a scan, get its cloud.",
-        license(name = "MIT OR Apache-2.0", identifier = "MIT OR Apache-2.0")
-    ),
-    tags(
-        (name = "scans", description = "Ask for scans, look at them, stop, change and delete them"),
-        (name = "artifacts", description = "Files of a scan"),
-        (name = "live", description = "What goes on while it goes on"),
-        (name = "service", description = "The service itself")
-    )
-)]
-struct Document;
-
 fn router() -> OpenApiRouter<App> {
-    OpenApiRouter::with_openapi(Document::openapi())
+    OpenApiRouter::with_openapi(document::Document::openapi())
         .routes(routes!(scans::list_scans, scans::post_scan))
         .routes(routes!(scans::get_scan, scans::patch_scan, scans::delete_scan))
         .routes(routes!(scans::cancel_scan))
@@ -175,7 +160,7 @@ fn router() -> OpenApiRouter<App> {
 /// The API document, made from the handlers.
 pub fn openapi() -> String {
     let (_, document) = router().split_for_parts();
-    let mut text = document.to_pretty_json().unwrap_or_default();
+    let mut text = document::complete(document).to_pretty_json().unwrap_or_default();
     text.push('\n');
     text
 }

@@ -99,7 +99,8 @@ fn key(
 /// same body gets the same answer and starts nothing, over restarts as well.
 #[utoipa::path(
     post, path = "/v1/scans", tag = "scans", params(WaitParams,
-        ("Idempotency-Key" = Option<String>, Header, description = "Key of the request, such as a UUID")),
+        ("Idempotency-Key" = Option<String>, Header, description = "Key of the request, such as a UUID; may be quoted",
+            pattern = r#"^"?[!#-~]([ -~]{0,252}[!#-~])?"?$"#)),
     request_body = ScanRequest,
     responses(
         (status = 202, description = "Accepted", body = Scan,
@@ -299,12 +300,14 @@ pub struct Empty {}
 /// Makes a scan of its own from the recorded frames, without the rig. The source cannot be deleted before it.
 #[utoipa::path(
     post, path = "/v1/scans/{id}/reprocess", tag = "scans", params(("id" = String, Path), WaitParams,
-        ("Idempotency-Key" = Option<String>, Header, description = "Key of the request, such as a UUID")),
-    request_body = ReprocessRequest,
+        ("Idempotency-Key" = Option<String>, Header, description = "Key of the request, such as a UUID; may be quoted",
+            pattern = r#"^"?[!#-~]([ -~]{0,252}[!#-~])?"?$"#)),
+    request_body = Option<ReprocessRequest>,
     responses(
         (status = 202, description = "Accepted", body = Scan, headers(("Location" = String, description = "Address of the new scan"))),
         (status = 404, description = "Unknown", body = ProblemBody, content_type = "application/problem+json"),
-        (status = 409, description = "It has no frames yet, or none at all", body = ProblemBody, content_type = "application/problem+json")))]
+        (status = 409, description = "It has no frames yet, or none at all", body = ProblemBody, content_type = "application/problem+json"),
+        (status = 429, description = "Queue full", body = ProblemBody, content_type = "application/problem+json")))]
 pub async fn reprocess_scan(
     Shared(app): Shared<App>,
     Id(id): Id,

@@ -61,7 +61,8 @@ pub async fn readyz(Shared(app): Shared<App>) -> Response {
 
 /// Metrics for Prometheus
 #[utoipa::path(get, path = "/metrics", tag = "service",
-    responses((status = 200, description = "OpenMetrics text", body = String, content_type = "text/plain")))]
+    responses((status = 200, description = "OpenMetrics text", body = String,
+        content_type = "application/openmetrics-text")))]
 pub async fn metrics(Shared(app): Shared<App>) -> Response {
     let kind = "application/openmetrics-text; version=1.0.0; charset=utf-8";
     ([(header::CONTENT_TYPE, kind)], app.scanner.metrics.text()).into_response()
@@ -211,6 +212,7 @@ pub async fn get_config(Shared(app): Shared<App>) -> Json<Value> {
 #[serde(deny_unknown_fields)]
 pub struct Projection {
     /// `white`, `h`, `v`, `black`, `focus`, `crosshair`, `checker`, or a pattern such as `column-0` or `column-0-inverse`.
+    #[schema(pattern = "^(white|h|v|black|focus|crosshair|checker|(column|row)-[0-9]+(-inverse)?)$")]
     show: String,
 }
 

@@ -42,6 +42,9 @@ const TICK: Duration = Duration::from_millis(500);
 /// From flip to steady light of a projector that was not measured.
 const UNMEASURED: Duration = Duration::from_millis(100);
 
+/// Test-only, and set by no unit: the label of scans in which the rig hangs for ever, as a driver that never returns does.
+const STALL_VARIABLE: &str = "POLSCAN_TEST_STALL";
+
 /// How long a frame for the preview is waited for, beyond its exposure.
 const PREVIEW_SLACK: Duration = Duration::from_millis(500);
 
@@ -245,6 +248,17 @@ pub fn run(shared: &Shared, commands: &Receiver<Command>) {
     }
 }
 
+/// Never returns from a scan that a test named to see what becomes of a rig that hangs.
+fn stall_if_asked(label: Option<&str>) {
+    let asked = std::env::var(STALL_VARIABLE).is_ok_and(|stalled| label == Some(stalled.as_str()));
+    if asked {
+        tracing::warn!("the rig hangs, as {STALL_VARIABLE} asks for");
+        loop {
+            std::thread::park();
+        }
+    }
+}
+
 /// Runs `open`, with a panic of a driver as an error like any other.
 fn guarded(open: impl FnOnce() -> Result<Open, Failure>) -> Result<Open, String> {
     match catch_unwind(AssertUnwindSafe(open)) {
@@ -302,6 +316,7 @@ impl Open {
         let id = job.label.id.clone();
         let span = tracing::info_span!("scan", id);
         let _inside = span.enter();
+        stall_if_asked(job.label.label.as_deref());
         let outcome = catch_unwind(AssertUnwindSafe(|| self.capture(shared, job)));
         let (news, broken) = match outcome {
             Ok(Ok(captured)) => {
