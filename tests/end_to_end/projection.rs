@@ -34,9 +34,9 @@ fn poses() -> impl Strategy<Value = Pose> {
 
 /// The paper's rig as the twin reads it.
 fn paper() -> RigDescription {
-    let text = fs::read_to_string(config().join("sim.toml")).unwrap();
-    let table: toml::Table = text.parse().unwrap();
-    table["sim"].clone().try_into().unwrap()
+    let text = fs::read_to_string(config().join("sim.toml")).expect("the rig");
+    let table: toml::Table = text.parse().expect("the rig is TOML");
+    table["sim"].clone().try_into().expect("a rig")
 }
 
 fn config() -> std::path::PathBuf {
@@ -60,7 +60,7 @@ fn twin(camera: &Lens, projector: &Lens, pose: &Pose) -> Projection {
         translation_mm: Some(pose.translation_mm.into()),
         ..PoseDescription::default()
     };
-    Projection::new(&rig).unwrap()
+    Projection::new(&rig).expect("a pose that is given fits")
 }
 
 fn apart_px(one: [f64; 2], other: [f64; 2]) -> f64 {
@@ -122,7 +122,7 @@ proptest! {
     }
 }
 
-/// Twenty thousand cases that are all left out would prove nothing.
+/// Cases that are all left out would prove nothing.
 #[test]
 fn most_points_of_most_rigs_are_seen_by_both() {
     let (camera, pose) = (paper(), Pose { rotation: Matrix3::identity(), translation_mm: Vector3::zeros() });
