@@ -355,7 +355,7 @@ fn an_exposure_that_answers_to_the_pictures_is_automatic() {
 
 #[test]
 fn a_lamp_that_beats_at_any_rate_is_not_automatic_exposure() {
-    for step in 1..16 {
+    for step in (1..16).step_by(2) {
         let angle = std::f64::consts::PI * f64::from(step) / 16.0;
         let mut scan = Scan::new(Mode::Pse);
         for at in 0..scan.frames.len() {
