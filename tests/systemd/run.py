@@ -154,6 +154,10 @@ def readiness(box):
     check(owner == "polscan", "its bundle is the service's", owner)
     until(lambda: box.show("StatusText") == "idle", "STATUS says idle")
     check(True, "STATUS is told to systemd", box.show("StatusText"))
+    before = box.show("MainPID")
+    box.shell("systemctl reload polscan")
+    status, _ = box.ask("GET", "/livez")
+    check(box.show("MainPID") == before and status == 200, "a reload reads tokens and certificate again, and goes on")
     return identity
 
 
