@@ -8,6 +8,7 @@ that cannot scan or 501 of what is not there, on answers that the document does 
 at error level. /v1/events and /v1/preview.mjpeg never end, so what they answer to odd parameters is asked here by hand.
 """
 
+import atexit
 import http.client
 import json
 import os
@@ -50,6 +51,8 @@ class Service:
         address = self.folder / "address"
         command = [binary, "serve", "--json", "--config", self.config, "--address-file", address]
         self.process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=self.log)
+        # Whatever ends this program, the service does not outlive it.
+        atexit.register(self.process.kill)
         self.wait(address.exists, "the service does not listen")
         host, port = address.read_text().strip().rsplit(":", 1)
         self.address = (host, int(port))
