@@ -2,6 +2,7 @@ use polscan_drivers::{clock::Timestamp, frame::FrameStamp};
 use polscan_patterns::{Mode, ProjectorSize};
 
 use super::*;
+use crate::decode::synth::{normal, random};
 
 const WIDTH: usize = 400;
 const HEIGHT: usize = 60;
@@ -24,24 +25,12 @@ fn levels(seed: u64, level: impl Fn(usize) -> f64) -> Frame {
         .map(|at| {
             let level = level(at % WIDTH);
             let sigma = (NOISE.variance(level) - 1.0 / 12.0).sqrt();
-            (level + sigma * normal(seed << 32 ^ at as u64)).round() as u16
+            (level + sigma * normal(random(seed) ^ random(at as u64 + 77))).round() as u16
         })
         .collect();
     let (received, exposure_start) = (Timestamp(0), Timestamp(0));
     let stamp = FrameStamp { frame_id: seed, trigger: seed, exposure_start, received, device_time_ns: None };
     Frame { width: WIDTH as u32, height: HEIGHT as u32, bit_depth: 12, stamp, store: Arc::new(samples) }
-}
-
-/// Close to a standard normal number that only depends on the key: the sum of twelve uniform ones.
-fn normal(key: u64) -> f64 {
-    let uniform = |draw: u64| {
-        // The mixing steps of splitmix64.
-        let mut z = (key * 12 + draw).wrapping_mul(0x9E37_79B9_7F4A_7C15);
-        z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-        (z ^ (z >> 31)) as f64 / u64::MAX as f64
-    };
-    (0..12).map(uniform).sum::<f64>() - 6.0
 }
 
 fn set(bit: u8, x: usize) -> bool {
