@@ -50,13 +50,7 @@ fn worst_pair(results: &Results) -> Option<Grid<f32>> {
     let (job, decoded) = (results.job, &results.outcome.decoded);
     let planes: Vec<(Role, Plane<'_>)> =
         job.roles.iter().copied().zip(job.planes.iter().map(|plane| plane.plane())).collect();
-    let frames = evidence::Frames {
-        all: &planes,
-        settings: &job.decode,
-        decoded,
-        last_references: true,
-        adjusts: false,
-    };
+    let frames = evidence::Frames::new(&planes, &job.decode, decoded);
     let pair = evidence::worst_pair(&decoded.pairs)?;
     frames.residual_map(pair.axis, pair.bit)
 }

@@ -141,6 +141,11 @@ impl Look {
 }
 
 impl<'a> Frames<'a> {
+    /// Frames of which nothing is held against them yet.
+    pub fn new(all: &'a [(Role, Plane<'a>)], settings: &'a DecodeSettings, decoded: &'a Decoded) -> Self {
+        Self { all, settings, decoded, last_references: true, adjusts: false }
+    }
+
     /// Frames of a role in the order of the sequence.
     pub fn of(&self, wanted: Role) -> Vec<Plane<'a>> {
         self.all.iter().filter(|(role, _)| *role == wanted).map(|(_, plane)| *plane).collect()

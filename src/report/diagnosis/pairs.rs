@@ -10,6 +10,7 @@ mod light;
 use polscan_patterns::Axis;
 use serde_json::{Value, json};
 
+pub(super) use self::light::is_automatic;
 use super::{Diagnosis, Reason};
 use crate::{
     decode::{Decoded, PairResidual},
@@ -199,11 +200,6 @@ pub fn diagnose(decoded: &Decoded, frames: Option<Frames>) -> Vec<Reason> {
         }
     }
     reasons
-}
-
-/// Whether the camera adjusted its exposure to the pictures.
-pub(super) fn adjusts(decoded: &Decoded, frames: Frames) -> bool {
-    light::is_automatic(decoded, frames)
 }
 
 fn views(pairs: &[PairResidual]) -> Vec<View<'_>> {

@@ -76,15 +76,9 @@ const OF_THE_LIGHT: [Diagnosis; 7] = [
 
 fn from_pixels(input: &ReportInput, decoded: &Decoded, pixels: &PixelCounts) -> Vec<Reason> {
     let look = input.settings.filter(|_| !input.planes.is_empty());
-    let mut look = look.map(|settings| Frames {
-        all: input.planes,
-        settings,
-        decoded,
-        last_references: true,
-        adjusts: false,
-    });
+    let mut look = look.map(|settings| Frames::new(input.planes, settings, decoded));
     if let Some(frames) = &mut look {
-        frames.adjusts = pairs::adjusts(decoded, *frames);
+        frames.adjusts = pairs::is_automatic(*frames);
     }
     // References that were exposed otherwise are no other pictures.
     let disagree = look.filter(|frames| !frames.adjusts).and_then(references::disagree);

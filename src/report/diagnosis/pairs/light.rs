@@ -23,12 +23,12 @@ use crate::{
 /// not always alike, so that more is asked for: a camera that adjusts itself follows its rule closely. The gains are those
 /// of bright pixels against the first bright reference, so that neither the other frame of a pair nor what the
 /// references were exposed like enters; steps within pairs alone are tried, too, for pairs that were taken again.
-pub(super) fn is_automatic(decoded: &Decoded, frames: Frames) -> bool {
+pub(in crate::report::diagnosis) fn is_automatic(frames: Frames) -> bool {
     let Some([bright, _]) = frames.all_references() else { return false };
     let Some(&reference) = bright.first() else { return false };
     // Per frame: its place in the scan, the logarithms of its gain and of its mean, and whether it is the first of a pair.
     let mut found: Vec<(usize, [f64; 2], bool)> = Vec::new();
-    for view in super::views(&decoded.pairs).iter().filter(|view| view.rank >= super::FINE_RANKS) {
+    for view in super::views(&frames.decoded.pairs).iter().filter(|view| view.rank >= super::FINE_RANKS) {
         let role = Role::Code { axis: view.pair.axis, bit: view.pair.bit, inverse: false };
         let Some(place) = frames.all.iter().position(|(other, _)| *other == role) else { continue };
         let Some((_, inverse)) = frames.all.get(place + 1) else { continue };
