@@ -3,7 +3,7 @@
 mod bad_input;
 mod captures_of_the_twin;
 #[path = "../faults/cases.rs"]
-#[allow(dead_code)]
+#[allow(dead_code, reason = "the suite of faults needs more of it")]
 mod cases;
 mod compare;
 mod faults;

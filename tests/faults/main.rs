@@ -9,7 +9,7 @@
 mod cases;
 mod recorder;
 #[path = "../end_to_end/rig.rs"]
-#[allow(dead_code)]
+#[allow(dead_code, reason = "the other suites need more of it")]
 mod rig;
 
 use std::{

@@ -4,15 +4,15 @@ mod client;
 mod daemon;
 mod kills;
 mod lifecycle;
-#[allow(dead_code)] // The long runs print what is measured here.
+#[allow(dead_code, reason = "the long runs print what is measured here")]
 mod listing;
 mod recovery;
 mod refusals;
 #[path = "../end_to_end/rig.rs"]
-#[allow(dead_code)] // The other suite needs more of it.
+#[allow(dead_code, reason = "the other suite needs more of it")]
 mod rig;
 mod scans;
-#[allow(dead_code)]
+#[allow(dead_code, reason = "the long runs print what is measured here")]
 mod soak;
 mod storage;
 mod streams;

@@ -2,10 +2,10 @@
 //! has short forms of the runs. The machine should have nothing else to do.
 
 #[path = "../service/client.rs"]
-#[allow(dead_code)] // The other suite needs more of it.
+#[allow(dead_code, reason = "the other suite needs more of it")]
 mod client;
 #[path = "../service/daemon.rs"]
-#[allow(dead_code)]
+#[allow(dead_code, reason = "the other suite needs more of it")]
 mod daemon;
 mod figures;
 #[path = "../service/kills.rs"]
@@ -13,7 +13,7 @@ mod kills;
 #[path = "../service/listing.rs"]
 mod listing;
 #[path = "../end_to_end/rig.rs"]
-#[allow(dead_code)]
+#[allow(dead_code, reason = "the other suites need more of it")]
 mod rig;
 #[path = "../service/soak.rs"]
 mod soak;
