@@ -17,4 +17,5 @@ pub mod store;
 pub mod truth;
 pub mod verify;
 
+pub use polscan_calibration as calibration;
 pub use polscan_reconstruction::{cloud, decode, geometry, grid};

@@ -1,0 +1,1 @@
+//! Photon transfer: gain, read noise, black level, linearity, saturation.

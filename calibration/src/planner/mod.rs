@@ -1,0 +1,1 @@
+//! What a rig will do, from its data sheets, before anything is bolted down.

@@ -1,0 +1,1 @@
+//! Extinction, azimuth of the analyser, channels, drive levels and misregistration.

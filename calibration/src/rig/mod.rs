@@ -1,0 +1,1 @@
+//! Both intrinsics, distortions and the pose between camera and projector, from views of a board.

@@ -1,0 +1,1 @@
+//! Output latency, rise and fall of the display, ripple of its lamp, and when it is safe to expose.
