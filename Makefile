@@ -21,9 +21,9 @@ faults: ## let everything go wrong on the simulated rig, and see what it is call
 	@scripts/install build
 	@scripts/faults
 
-soak: ## 300 scans in a row with polling and following clients, and lists of 10 000 scans
+soak: ## 500 scans in a row with polling and following clients, and lists of 10 000 scans
 	@scripts/install build
-	@scripts/soak three_hundred_scans ten_thousand_scans
+	@scripts/soak five_hundred_scans ten_thousand_scans
 
 kills: ## 50 deaths of the service at random moments under load
 	@scripts/install build
