@@ -15,6 +15,8 @@ use super::{
 const FOCAL_GUESSES: [f64; 5] = [0.5, 1.0, 2.0, 4.0, 7.0];
 /// Plane points per view that judge a start.
 const JUDGES: usize = 100;
+/// Corners per view that judge a start of the camera.
+const JUDGE_CORNERS: usize = 30;
 /// So many of the most promising starts of the projector are followed to their end.
 const TRIED: usize = 3;
 /// Noise at the start, in px: far off is not yet an outlier.
@@ -87,11 +89,12 @@ pub(super) fn camera(blocks: &[Block], size: (u32, u32), numbers: &[usize]) -> O
     let fixed =
         homography::focal_lengths(&homographies, centre).map(|[fx, fy]| [fx, fy, centre[0], centre[1]]);
     let closed = [fixed, homography::zhang(&homographies, [width, height])];
+    let few: Vec<Block> = corners.iter().map(fewer_corners).collect();
     let lenses = closed.into_iter().flatten().chain(guess).map(|k| pinhole(size, k)).filter(plausible);
     let mut starts: Vec<(f64, State)> = lenses
         .filter_map(|lens| {
             let optics = Optics { camera: lens, projector: lens, rig: nowhere(), aspect: 1.0 };
-            let found: Option<Vec<_>> = corners.iter().map(|b| board_pose(&optics, b, ROUGH)).collect();
+            let found: Option<Vec<_>> = few.iter().map(|b| board_pose(&optics, b, ROUGH)).collect();
             let (poses, costs): (Vec<_>, Vec<f64>) = found?.into_iter().unzip();
             Some((costs.iter().sum(), State { optics, poses }))
         })
@@ -105,6 +108,12 @@ pub(super) fn camera(blocks: &[Block], size: (u32, u32), numbers: &[usize]) -> O
         let fit = solve(numbers, solve(&numbers[..4], start)?.state)?;
         plausible(&fit.state.optics.camera).then_some(fit)
     })
+}
+
+/// Every so many corners, all over the board: enough to judge a start by.
+fn fewer_corners(block: &Block) -> Block {
+    let every = block.corners.len().div_ceil(JUDGE_CORNERS).max(1);
+    Block { corners: block.corners.iter().step_by(every).copied().collect(), plane_points: Vec::new() }
 }
 
 /// A plane point's place: on the board, in the camera frame, and its projector pixel.

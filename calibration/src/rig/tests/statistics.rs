@@ -12,7 +12,7 @@ use crate::rig::{
     setup::Setup,
 };
 
-const NOISE: Made = Made { camera_px: 0.05, projector_px: 0.1, every_px: 26 };
+const NOISE: Made = Made { camera_px: 0.05, projector_px: 0.1, every_px: 40 };
 
 pub(super) fn blocks(views: Vec<crate::observation::View>) -> Vec<Block> {
     views.into_iter().map(|v| Block { corners: v.corners, plane_points: v.plane_points }).collect()
@@ -51,7 +51,7 @@ fn errors(found: &Estimate, truth: &Truth) -> (Vec<f64>, Vec<f64>) {
 
 #[test]
 fn errors_are_as_large_as_their_covariance_says() {
-    let found: Vec<_> = (0..50u64)
+    let found: Vec<_> = (0..std::env::var("RIGS").map_or(50, |v| v.parse().unwrap()))
         .into_par_iter()
         .map(|seed| {
             let truth = Truth::random(1000 + seed, 10);
@@ -79,7 +79,7 @@ fn errors_are_as_large_as_their_covariance_says() {
         |pick: fn(&((Vec<f64>, Vec<f64>), f64, f64, f64)) -> f64| found.iter().map(pick).fold(0.0, f64::max);
     let (camera, projector) = (worst(|f| f.2), worst(|f| f.3));
     println!(
-        "50 rigs: {:.2} % of {} shared and {:.2} % of {} board parameters beyond 3 sigma, spread {:.3} and {:.3}; \
+        "rigs: {:.2} % of {} shared and {:.2} % of {} board parameters beyond 3 sigma, spread {:.3} and {:.3}; \
          chi-square {chi:.3}; worst rms camera {camera:.3} px, projector {projector:.3} px",
         100.0 * beyond(&shared),
         shared.len(),
@@ -90,22 +90,4 @@ fn errors_are_as_large_as_their_covariance_says() {
     );
     assert!(beyond(&shared) <= 0.01 && beyond(&boards) <= 0.01);
     assert!((0.8..1.25).contains(&chi) && camera <= 0.3 && projector <= 0.3);
-}
-
-#[test]
-fn zz_time() {
-    let truth = Truth::random(1000, 10);
-    let blocks = blocks(truth.views(NOISE, 0));
-    let setup = Setup::rig((1600, 1200), (1024, 768));
-    let task = Task::new(&setup);
-    println!("points {:?}", blocks.iter().map(|b| b.plane_points.len()).collect::<Vec<_>>());
-    let t = std::time::Instant::now();
-    let c = crate::rig::initial::camera(&blocks, (1600, 1200), &[0, 1, 2, 3, 4, 5, 6, 7]).unwrap();
-    println!("camera {:?}", t.elapsed());
-    let t = std::time::Instant::now();
-    crate::rig::initial::projector(&blocks, &c.state, (1024, 768), &[0, 1, 2, 3, 4, 5, 6, 7], &[]).unwrap();
-    println!("projector {:?}", t.elapsed());
-    let t = std::time::Instant::now();
-    task.estimate(&blocks).unwrap();
-    println!("all {:?}", t.elapsed());
 }

@@ -94,7 +94,8 @@ impl Truth {
             ],
         };
         let distance = within(600.0, 1200.0);
-        let throw = within(1.3, 1.9) * 1024.0;
+        // The projector's field is somewhat wider than the camera's, so that boards in the corners are lit.
+        let throw = (focal / 1600.0 * within(0.7, 0.85)).min(1.9) * 1024.0;
         let projector = Lens {
             width: 1024,
             height: 768,
