@@ -61,7 +61,8 @@ pub fn calibrate(views: &[View], setup: &Setup) -> Result<Calibrated, Refused> {
         return Err(Refused { refusals, report: Some(Box::new(report)) });
     }
     let (_, covariance) = parameters(&task, &estimate);
-    Ok(Calibrated { calibration, boards: estimate.fit.state.poses, covariance, report })
+    let board_covariances = estimate.fit.covariance.poses;
+    Ok(Calibrated { calibration, boards: estimate.fit.state.poses, board_covariances, covariance, report })
 }
 
 fn calibration_of(estimate: &Estimate, setup: &Setup) -> Calibration {

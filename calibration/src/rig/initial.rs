@@ -17,7 +17,7 @@ const FOCAL_GUESSES: [f64; 5] = [0.5, 1.0, 2.0, 4.0, 7.0];
 const JUDGES: usize = 100;
 /// Corners per view that judge a start of the camera.
 const JUDGE_CORNERS: usize = 30;
-/// So many of the most promising starts of the projector are followed to their end.
+/// So many of the most promising starts are followed to their end.
 const TRIED: usize = 3;
 /// Noise at the start, in px: far off is not yet an outlier.
 const ROUGH: Noise = Noise { camera_px: 1.0, projector_px: 1.0, huber: 10.0 };
@@ -100,7 +100,7 @@ pub(super) fn camera(blocks: &[Block], size: (u32, u32), numbers: &[usize]) -> O
         })
         .collect();
     starts.sort_by(|a, b| a.0.total_cmp(&b.0));
-    starts.into_iter().find_map(|(_, start)| {
+    starts.into_iter().take(TRIED).find_map(|(_, start)| {
         let solve = |numbers: &[usize], start: State| {
             let free = free(numbers, &[], false);
             Problem { blocks: &corners, noise: ROUGH, free, poses_free: true, priors: &[] }.solve(start).ok()

@@ -244,7 +244,7 @@ fn outlier(report: &Report, verdict: &mut Verdict) -> Option<usize> {
     is_outlier.then_some(view)
 }
 
-fn worst<'a>(report: &'a Report, of: impl Fn(&ViewReport) -> Option<f64>) -> (f64, Option<&'a str>) {
+fn worst(report: &Report, of: impl Fn(&ViewReport) -> Option<f64>) -> (f64, Option<&str>) {
     let values = report.views.iter().filter_map(|v| Some((of(v)?, Some(v.name.as_str()))));
     values.max_by(|a, b| a.0.total_cmp(&b.0)).unwrap_or((0.0, None))
 }

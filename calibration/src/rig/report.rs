@@ -1,6 +1,6 @@
 //! What a calibration says of itself, and why one is refused.
 
-use nalgebra::DMatrix;
+use nalgebra::{DMatrix, Matrix6};
 use polscan_reconstruction::geometry::{Calibration, Pose};
 use serde::Serialize;
 use thiserror::Error;
@@ -14,6 +14,8 @@ pub struct Calibrated {
     pub calibration: Calibration,
     /// `camera_from_board` of every view, in the order of the views.
     pub boards: Vec<Pose>,
+    /// Covariance of each board's pose in the camera frame: a small turn on top of it in rad, then its shift in mm.
+    pub board_covariances: Vec<Matrix6<f64>>,
     /// Covariance of [`Report::parameters`], in their order and units.
     pub covariance: DMatrix<f64>,
     /// How good it is, and by what it was judged.

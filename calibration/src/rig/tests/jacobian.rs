@@ -18,7 +18,7 @@ fn check(optics: &Optics, board: &Pose, predict: impl Fn(&Optics, &Pose) -> Opti
     let typical = |k: usize| match k {
         0..=3 | 9..=12 => 1.0,
         4..=8 | 13..=17 => 1e-3,
-        _ if k < GLOBALS && k >= 21 && k < 24 => 1.0,
+        21..=23 => 1.0,
         _ if k >= GLOBALS + 3 => 1.0,
         _ => 1e-3,
     };
