@@ -1,6 +1,6 @@
 //! From views to an accepted calibration, or to the reasons against one.
 
-use nalgebra::{DMatrix, Rotation3, Vector2, Vector3};
+use nalgebra::{DMatrix, Rotation3, UnitQuaternion, Vector2, Vector3};
 use polscan_reconstruction::{
     cloud::fit_plane,
     geometry::{Calibration, Lens, Measurement, Pose, Projector, Quality, Triangulator},
@@ -168,7 +168,8 @@ fn name(k: usize) -> (String, &'static str) {
 fn parameters(task: &Task, estimate: &Estimate) -> (Vec<Parameter>, DMatrix<f64>) {
     let optics = &estimate.fit.state.optics;
     let Covariance { globals, .. } = &estimate.fit.covariance;
-    let turn = Rotation3::from_matrix_unchecked(optics.rig.rotation).scaled_axis();
+    let turn = Rotation3::from_matrix_unchecked(optics.rig.rotation);
+    let turn = UnitQuaternion::from_rotation_matrix(&turn).scaled_axis();
     let (camera, projector) = (lens_numbers(&optics.camera), lens_numbers(&optics.projector));
     let pose = turn.iter().chain(optics.rig.translation_mm.iter());
     let values: Vec<f64> = camera.iter().chain(&projector).chain(pose).copied().collect();
