@@ -7,6 +7,7 @@ mod bouguet;
 mod canonical;
 mod mat;
 mod matlab;
+mod opencv;
 mod storage;
 mod value;
 mod xml;

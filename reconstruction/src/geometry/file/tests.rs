@@ -57,6 +57,23 @@ fn our_own_file_round_trips_to_the_last_bit() {
     assert_ne!(other.id(), rig(1.0).id(), "one bit of one number is another calibration");
 }
 
+#[test]
+fn what_is_written_for_opencv_reads_back_to_the_last_bit() {
+    let mut written = full();
+    (written.world_from_camera, written.quality.method) = (None, None);
+    let alone = Calibration { projector: None, ..written.clone() };
+    let unknown = Calibration { quality: Quality::default(), ..rig(1.0) };
+    for mut calibration in [written, alone, unknown] {
+        let text = calibration.to_opencv_yaml();
+        if calibration.projector.is_none() {
+            calibration.quality.projector_rms_px = None;
+        }
+        let back = read(&text, "calibration.yml", &ReadHints::default());
+        calibration.quality.method = back.quality.method.clone();
+        assert_eq!(back, calibration, "{text}");
+    }
+}
+
 proptest! {
     #[test]
     fn any_usable_numbers_round_trip(fx in 1500.0..9000.0f64, k1 in -0.05..0.05f64, t in -500.0..-5.0f64, rms in 0.0..9.0f64) {
