@@ -37,7 +37,7 @@ impl Print {
         if !(finite && right.norm() > 1e-9 && down.norm() > 1e-9 && across) {
             faults.add(key, "needs a finite origin_mm, and right and down that are across each other");
         }
-        if self.cells.is_empty() || !self.cells.iter().all(String::is_ascii) {
+        if self.cells.is_empty() || !self.cells.iter().all(|row| row.is_ascii()) {
             faults.add(&format!("{key}.cells"), "must be rows of `#` and other ASCII letters");
         }
     }
