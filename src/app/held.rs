@@ -58,7 +58,8 @@ impl Cells {
         let square = rectangles.iter().map(|[_, _, width, _]| *width).fold(0.0, f64::max);
         let whole = |value: f64, cell: f64| ((value / cell) - (value / cell).round()).abs() < 1e-6;
         let fits = |cell: f64| rectangles.iter().flatten().chain(&size).all(|&value| whole(value, cell));
-        let Some(cell) = (1..=MOST_CELLS).map(|parts| square / f64::from(parts)).find(|&cell| fits(cell)) else {
+        let Some(cell) = (1..=MOST_CELLS).map(|parts| square / f64::from(parts)).find(|&cell| fits(cell))
+        else {
             return Err(refused(
                 "its squares and markers fit no common grid: make marker_mm three quarters of square_mm with 4x4 markers",
             ));
@@ -66,7 +67,8 @@ impl Cells {
         let count = size.map(|side| (side / cell).round() as usize);
         let mut cells = vec![vec![b'.'; count[0]]; count[1]];
         for [left, top, width, height] in rectangles {
-            let [left, top, width, height] = [left, top, width, height].map(|value| (value / cell).round() as usize);
+            let [left, top, width, height] =
+                [left, top, width, height].map(|value| (value / cell).round() as usize);
             cells[top..top + height].iter_mut().for_each(|row| row[left..left + width].fill(b'#'));
         }
         let text = |row: Vec<u8>| String::from_utf8(row).expect("cells are ASCII");
@@ -84,7 +86,8 @@ fn held(print: &Cells, board: &Board, description: &RigDescription, number: u32)
     let aimed = description.pose.aim_mm.unwrap_or(DISTANCE_MM);
     let distance = fitting.clamp(0.75 * aimed, 1.25 * aimed) * [1.0, 1.06, 0.95][number as usize % 3];
     // Around the image by quarters, every fifth in the middle.
-    let [across, down] = [[-1.0, -1.0], [1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [0.0, 0.0]][number as usize % 5];
+    let [across, down] =
+        [[-1.0, -1.0], [1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [0.0, 0.0]][number as usize % 5];
     let share = 0.5 * (1.0 - FILLS);
     let centre = camera.principal_point_px.unwrap_or([0.5 * (width - 1.0), 0.5 * (height - 1.0)]);
     let at = [centre[0] + across * share * height, centre[1] + down * share * height * 0.8];
@@ -98,7 +101,8 @@ fn held(print: &Cells, board: &Board, description: &RigDescription, number: u32)
     let tilt = TILT_DEG.to_radians() * if number % 5 == 4 { 0.6 } else { 1.0 };
     let axis = nalgebra::Unit::new_normalize(Vector3::new(direction.cos(), direction.sin(), 0.0));
     let roll = (f64::from(number * 37 % 60) - 30.0).to_radians() * 0.5;
-    let turned = Rotation3::from_axis_angle(&axis, tilt) * Rotation3::from_axis_angle(&Vector3::z_axis(), roll);
+    let turned =
+        Rotation3::from_axis_angle(&axis, tilt) * Rotation3::from_axis_angle(&Vector3::z_axis(), roll);
     let [right, down, normal] = [Vector3::x(), Vector3::y(), -Vector3::z()].map(|axis| turned * axis);
     let origin = middle - right * (0.5 * size[0]) - down * (0.5 * size[1]);
     let array = |vector: Vector3<f64>| [vector.x, vector.y, vector.z];
@@ -117,13 +121,7 @@ fn held(print: &Cells, board: &Board, description: &RigDescription, number: u32)
         }),
         shape: Shape::Plane(Plane { point_mm: array(middle), normal: array(normal), x_mm: None, y_mm: None }),
     };
-    let paper = Material {
-        index: None,
-        roughness: 0.3,
-        diffuse: 0.8,
-        tint: [1.0; 3],
-        texture: 0.0,
-        texture_mm: 6.0,
-    };
+    let paper =
+        Material { index: None, roughness: 0.3, diffuse: 0.8, tint: [1.0; 3], texture: 0.0, texture_mm: 6.0 };
     Scene { materials: [("paper".to_owned(), paper)].into(), objects: vec![object] }
 }

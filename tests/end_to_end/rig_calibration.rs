@@ -42,7 +42,10 @@ fn a_calibration_found_with_a_board_scans_as_well_as_the_true_one() {
     let (with_true, with_found) = (planes("true-scan"), planes("found-scan"));
     assert_eq!(with_true.len(), 2);
     for (with_true, with_found) in with_true.iter().zip(&with_found) {
-        assert!(*with_found < 1.1 * with_true, "{with_found} mm with the found one, {with_true} mm with the true one");
+        assert!(
+            *with_found < 1.1 * with_true,
+            "{with_found} mm with the found one, {with_true} mm with the true one"
+        );
     }
 
     // Solved again from what is on the disk, without a view, and with too few.

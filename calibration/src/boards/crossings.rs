@@ -11,8 +11,22 @@ use super::picture::Picture;
 
 /// Circle of the ChESS response, in order of the angle.
 const RING: [(i64, i64); 16] = [
-    (5, 0), (5, 2), (3, 3), (2, 5), (0, 5), (-2, 5), (-3, 3), (-5, 2),
-    (-5, 0), (-5, -2), (-3, -3), (-2, -5), (0, -5), (2, -5), (3, -3), (5, -2),
+    (5, 0),
+    (5, 2),
+    (3, 3),
+    (2, 5),
+    (0, 5),
+    (-2, 5),
+    (-3, 3),
+    (-5, 2),
+    (-5, 0),
+    (-5, -2),
+    (-3, -3),
+    (-2, -5),
+    (0, -5),
+    (2, -5),
+    (3, -3),
+    (5, -2),
 ];
 /// Radius of the circle on which edges are read, in px.
 const EDGE_RADIUS: f64 = 4.5;

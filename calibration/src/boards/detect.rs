@@ -97,8 +97,10 @@ pub enum DetectError {
         wanted: usize,
     },
     /// The picture is blurred.
-    #[error("the picture is blurred: edges of the board are {width_px:.1} px wide, at most {limit_px:.1} are allowed; \
-             focus, or hold the board still")]
+    #[error(
+        "the picture is blurred: edges of the board are {width_px:.1} px wide, at most {limit_px:.1} are allowed; \
+             focus, or hold the board still"
+    )]
     Blurred {
         /// Median width of edges.
         width_px: f64,
@@ -247,9 +249,8 @@ fn lattice_width(picture: &Picture, scale: f64, crossings: &[Crossing], nodes: &
     let up = |value: f64| value * scale + 0.5 * (scale - 1.0);
     let at: HashMap<[i32; 2], [f64; 2]> =
         nodes.iter().map(|node| (node.cell, crossings[node.crossing].at.map(up))).collect();
-    let width = |(cell, &from): (&[i32; 2], &[f64; 2])| {
-        edge_width(picture, from, *at.get(&[cell[0] + 1, cell[1]])?)
-    };
+    let width =
+        |(cell, &from): (&[i32; 2], &[f64; 2])| edge_width(picture, from, *at.get(&[cell[0] + 1, cell[1]])?);
     median(at.iter().filter_map(width).collect())
 }
 

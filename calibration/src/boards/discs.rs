@@ -122,8 +122,9 @@ fn disc(picture: &Picture, pixels: &[usize]) -> Option<Disc> {
             .then(|| f64::from(picture.at(x as usize, y as usize)))
     };
     let box_of = |by: i64| {
-        (-reach[1] - by..=reach[1] + by)
-            .flat_map(move |dy| (-reach[0] - by..=reach[0] + by).map(move |dx| (centre[0] + dx, centre[1] + dy)))
+        (-reach[1] - by..=reach[1] + by).flat_map(move |dy| {
+            (-reach[0] - by..=reach[0] + by).map(move |dx| (centre[0] + dx, centre[1] + dy))
+        })
     };
     let determinant = xx * yy - xy * xy;
     // Squared distance in units of the ellipse: 4 on its edge.
@@ -183,7 +184,8 @@ pub(super) fn identify(board: &Circles, discs: &[Disc]) -> Result<Vec<(usize, u3
 
 /// Places of the discs of the board on a square lattice of nearest neighbours.
 fn lattice_cells(board: &Circles) -> Vec<[i32; 2]> {
-    let places = (0..board.rows as i32).flat_map(|row| (0..board.columns as i32).map(move |column| (column, row)));
+    let places =
+        (0..board.rows as i32).flat_map(|row| (0..board.columns as i32).map(move |column| (column, row)));
     let cell = |(column, row): (i32, i32)| match board.asymmetric {
         // Staggered rows are a square lattice turned by an eighth: half steps x and y become (x + y) / 2, (y - x) / 2.
         true => {
@@ -206,11 +208,11 @@ fn number(board: &Circles, discs: &[Disc], lattice: &HashMap<[i32; 2], usize>) -
             2 => [-x, -y],
             _ => [-y, x],
         };
-        let found: HashMap<[i32; 2], usize> = lattice.iter().map(|(&cell, &disc)| (turn(cell), disc)).collect();
+        let found: HashMap<[i32; 2], usize> =
+            lattice.iter().map(|(&cell, &disc)| (turn(cell), disc)).collect();
         let [least, _] = bounds(found.keys().copied())?;
-        let place = |cell: &[i32; 2]| {
-            found.get(&[cell[0] - low[0] + least[0], cell[1] - low[1] + least[1]]).copied()
-        };
+        let place =
+            |cell: &[i32; 2]| found.get(&[cell[0] - low[0] + least[0], cell[1] - low[1] + least[1]]).copied();
         let Some(known) = cells.iter().map(place).collect::<Option<Vec<usize>>>() else { continue };
         // Of several ways the one whose first disc is nearest to the top left.
         let nearness = discs[known[0]].at[0] + discs[known[0]].at[1];
@@ -224,9 +226,8 @@ fn number(board: &Circles, discs: &[Disc], lattice: &HashMap<[i32; 2], usize>) -
 /// Joins neighbours from a disc on; `None` where it has no two neighbours that span a lattice.
 fn grow(discs: &[Disc], start: usize, most: usize) -> Option<HashMap<[i32; 2], usize>> {
     let alike = |disc: &Disc| (0.4..2.5).contains(&(disc.radius_px / discs[start].radius_px));
-    let offset = |from: usize, to: usize| {
-        [discs[to].at[0] - discs[from].at[0], discs[to].at[1] - discs[from].at[1]]
-    };
+    let offset =
+        |from: usize, to: usize| [discs[to].at[0] - discs[from].at[0], discs[to].at[1] - discs[from].at[1]];
     let length = |[x, y]: [f64; 2]| x.hypot(y);
     let mut near: Vec<(f64, usize)> = (0..discs.len())
         .filter(|&other| other != start && alike(&discs[other]))
@@ -254,7 +255,8 @@ fn grow(discs: &[Disc], start: usize, most: usize) -> Option<HashMap<[i32; 2], u
             }
             let step = axes[axis].map(|value| value * f64::from(sign));
             let wanted = [discs[disc].at[0] + step[0], discs[disc].at[1] + step[1]];
-            let missed = |other: usize| length([discs[other].at[0] - wanted[0], discs[other].at[1] - wanted[1]]);
+            let missed =
+                |other: usize| length([discs[other].at[0] - wanted[0], discs[other].at[1] - wanted[1]]);
             let nearest = (0..discs.len())
                 .filter(|&other| !used[other] && alike(&discs[other]))
                 .min_by(|&a, &b| missed(a).total_cmp(&missed(b)));

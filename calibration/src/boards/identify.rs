@@ -82,9 +82,11 @@ pub(super) fn checkerboard(
                     let [x, y] = crossings[nodes[node].crossing].at;
                     x + y
                 });
-                let score = (known.len() as i64) * 1_000_000 + i64::from(right_parity) * 500_000 - nearness as i64;
+                let score =
+                    (known.len() as i64) * 1_000_000 + i64::from(right_parity) * 500_000 - nearness as i64;
                 if best.as_ref().is_none_or(|(most, _)| score > *most) {
-                    let known = known.into_iter().map(|(node, id, spacing)| (nodes[node].crossing, id, spacing));
+                    let known =
+                        known.into_iter().map(|(node, id, spacing)| (nodes[node].crossing, id, spacing));
                     best = Some((score, known.collect()));
                 }
             }
@@ -120,9 +122,7 @@ fn window(
     debug_assert!(nodes.iter().all(|node| node.crossing < crossings.len()));
     let inside = |&[x, y]: &[i32; 2]| (0..columns).contains(&(x - left)) && (0..rows).contains(&(y - top));
     let found = cells.iter().enumerate().filter(|(_, cell)| inside(cell));
-    found
-        .map(|(node, [x, y])| (node, ((y - top) * columns + x - left) as u32, nodes[node].spacing))
-        .collect()
+    found.map(|(node, [x, y])| (node, ((y - top) * columns + x - left) as u32, nodes[node].spacing)).collect()
 }
 
 /// Nine of ten corners are there, and some of every row and column: otherwise it is not known which ones these are.
@@ -140,7 +140,8 @@ pub(super) fn charuco(
     crossings: &[Crossing],
     nodes: &[Node],
 ) -> Result<Vec<Known>, Mismatch> {
-    let at: HashMap<[i32; 2], &Crossing> = nodes.iter().map(|node| (node.cell, &crossings[node.crossing])).collect();
+    let at: HashMap<[i32; 2], &Crossing> =
+        nodes.iter().map(|node| (node.cell, &crossings[node.crossing])).collect();
     let squares = board.marked_squares();
     let codes = board.dictionary.codes();
     let side = board.dictionary.side();
@@ -198,10 +199,8 @@ fn board_code(bits: &[bool], side: usize, quarter: usize) -> u64 {
 
 /// Reads the bits of the marker in a square whose corners are given in turn; `None` where there is no marker.
 fn read_bits(board: &Charuco, picture: &Picture, corners: [&Crossing; 4]) -> Option<Vec<bool>> {
-    let square = homography(
-        &[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]],
-        &corners.map(|crossing| crossing.at),
-    )?;
+    let square =
+        homography(&[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]], &corners.map(|crossing| crossing.at))?;
     let side = board.dictionary.side();
     let bit = board.marker_mm / board.square_mm / (side + 2) as f64;
     let margin = 0.5 * (1.0 - board.marker_mm / board.square_mm);

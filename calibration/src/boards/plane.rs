@@ -59,7 +59,8 @@ fn thinned(points: Vec<PlanePoint>, most: usize) -> Vec<PlanePoint> {
         return points;
     }
     let step = (points.len() as f64 / most as f64).sqrt().ceil() as u64;
-    let on_grid = |point: &PlanePoint| point.camera_px.iter().all(|&value| (value as u64).is_multiple_of(step));
+    let on_grid =
+        |point: &PlanePoint| point.camera_px.iter().all(|&value| (value as u64).is_multiple_of(step));
     points.into_iter().filter(on_grid).collect()
 }
 

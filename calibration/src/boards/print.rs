@@ -32,15 +32,17 @@ pub fn dark_shapes(board: &Board) -> Vec<Shape> {
         Pattern::Charuco(pattern) => {
             let marked = pattern.marked_squares();
             let light = |column, row| marked.contains(&[column, row]);
-            let mut shapes =
-                squares([pattern.columns, pattern.rows], pattern.square_mm, |column, row| !light(column, row));
+            let mut shapes = squares([pattern.columns, pattern.rows], pattern.square_mm, |column, row| {
+                !light(column, row)
+            });
             for (&square, code) in marked.iter().zip(pattern.dictionary.codes()) {
                 shapes.extend(marker(pattern, square, code));
             }
             shapes
         }
         Pattern::Circles(pattern) => {
-            let places = (0..pattern.rows).flat_map(|row| (0..pattern.columns).map(move |column| (column, row)));
+            let places =
+                (0..pattern.rows).flat_map(|row| (0..pattern.columns).map(move |column| (column, row)));
             let disc = |(column, row)| {
                 let [x, y] = pattern.centre(column, row);
                 Shape::Disc([x, y, 0.5 * pattern.diameter_mm])
@@ -52,9 +54,8 @@ pub fn dark_shapes(board: &Board) -> Vec<Shape> {
 
 fn squares([columns, rows]: [u32; 2], side: f64, is_dark: impl Fn(u32, u32) -> bool) -> Vec<Shape> {
     let places = (0..rows).flat_map(|row| (0..columns).map(move |column| (column, row)));
-    let square = |(column, row)| {
-        Shape::Rectangle([f64::from(column) * side, f64::from(row) * side, side, side])
-    };
+    let square =
+        |(column, row)| Shape::Rectangle([f64::from(column) * side, f64::from(row) * side, side, side]);
     places.filter(|&(column, row)| is_dark(column, row)).map(square).collect()
 }
 

@@ -49,7 +49,8 @@ fn step(picture: &Picture, at: [f64; 2], reach: f64, noise: f64) -> Option<Refin
     for (v, u) in (-side..=side).flat_map(|v| (-side..=side).map(move |u| (v as f64, u as f64))) {
         let here = [at[0] + u, at[1] + v];
         let difference = |dx: f64, dy: f64| {
-            0.5 * (picture.sample([here[0] + dx, here[1] + dy]) - picture.sample([here[0] - dx, here[1] - dy]))
+            0.5 * (picture.sample([here[0] + dx, here[1] + dy])
+                - picture.sample([here[0] - dx, here[1] - dy]))
         };
         let weight = (-(u * u + v * v) / (reach * reach)).exp();
         cells.push(([difference(1.0, 0.0), difference(0.0, 1.0)], [u, v], weight));

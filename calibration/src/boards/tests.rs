@@ -125,8 +125,7 @@ fn find(board: &Board, scene: &Scene) -> Result<Found, DetectError> {
 #[test]
 fn boards_of_all_kinds_are_found_whole_and_right_side_up_however_they_lie() {
     // Each of these tells its ends apart.
-    let boards =
-        [checkerboard(8, 5), charuco(false), charuco(true), circles(4, 9, true)];
+    let boards = [checkerboard(8, 5), charuco(false), charuco(true), circles(4, 9, true)];
     for board in boards {
         for (turn, tilt) in
             [(4.0, [0.0, 0.0]), (100.0, [8e-4, -3e-4]), (181.0, [-9e-4, 5e-4]), (-75.0, [2e-4, 1e-3])]
@@ -318,14 +317,18 @@ fn plane_points_lie_inside_the_corners_and_away_from_printed_edges() {
         losses: Vec::new(),
     };
     let corner = |id, camera_px| crate::observation::Corner { id, board_mm: [0.0; 2], camera_px };
-    let corners = [corner(0, [10.0, 5.0]), corner(1, [50.0, 5.0]), corner(2, [50.0, 35.0]), corner(3, [10.0, 35.0])];
+    let corners =
+        [corner(0, [10.0, 5.0]), corner(1, [50.0, 5.0]), corner(2, [50.0, 35.0]), corner(3, [10.0, 35.0])];
     let input = |most| PlaneInput { decoded: &decoded, corners: &corners, most };
     let points = plane_points(&input(usize::MAX));
     // 41 x 31 pixels, less four columns at the edge, less the one that was not decoded.
     assert_eq!(points.len(), 41 * 31 - 4 * 31 - 1);
     for point in &points {
         let [x, y] = point.camera_px;
-        assert!((10.0..=50.0).contains(&x) && (5.0..=35.0).contains(&y) && !(28.0..=31.0).contains(&x), "{x} {y}");
+        assert!(
+            (10.0..=50.0).contains(&x) && (5.0..=35.0).contains(&y) && !(28.0..=31.0).contains(&x),
+            "{x} {y}"
+        );
         assert_eq!(point.projector_px, [2.0 * x, 3.0 * y]);
     }
     let few = plane_points(&input(100)).len();

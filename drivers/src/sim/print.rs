@@ -66,7 +66,8 @@ impl Print {
         if corners.iter().all(|corner| *corner == corners[0]) {
             return self.tone(middle);
         }
-        let samples = (0..SAMPLES * SAMPLES).map(|sample| at(offset(sample % SAMPLES), offset(sample / SAMPLES)));
+        let samples =
+            (0..SAMPLES * SAMPLES).map(|sample| at(offset(sample % SAMPLES), offset(sample / SAMPLES)));
         samples.map(|at| self.tone(at)).sum::<f64>() / f64::from(SAMPLES * SAMPLES)
     }
 }
@@ -92,7 +93,10 @@ mod tests {
         let place = print.place(Vector3::new(-1.5, -0.5, 100.0));
         assert_eq!(place, [1.0, 1.0]);
         let small = |at| print.over(at, [0.1, 0.0], [0.0, 0.1]);
-        assert_eq!([small([0.5, 0.5]), small([1.5, 0.5]), small([-0.5, 0.5]), small([2.5, 1.5])], [0.25, 1.0, 1.0, 1.0]);
+        assert_eq!(
+            [small([0.5, 0.5]), small([1.5, 0.5]), small([-0.5, 0.5]), small([2.5, 1.5])],
+            [0.25, 1.0, 1.0, 1.0]
+        );
         // Two light and two dark cells meet in the middle.
         assert_eq!(print.over(place, [1.0, 0.0], [0.0, 1.0]), 0.625);
         // Turned by an eighth as well.

@@ -100,7 +100,10 @@ pub fn run(args: &Args, json: bool) -> Result<u8, Failure> {
     let board = args.board()?;
     let description = args.out.with_extension("toml");
     if description == args.out {
-        return Err(Failure::data("make a board", "--out names the page: give it another ending than .toml, such as .pdf"));
+        return Err(Failure::data(
+            "make a board",
+            "--out names the page: give it another ending than .toml, such as .pdf",
+        ));
     }
     let text = toml::to_string(&board).map_err(|error| Failure::storage("write the board", error))?;
     write_new(&args.out, &pdf::pdf(&board))?;
@@ -109,7 +112,9 @@ pub fn run(args: &Args, json: bool) -> Result<u8, Failure> {
     }
     let page_mm = pdf::page_mm(&board);
     if json {
-        say(serde_json::json!({ "out": args.out, "description": description, "page_mm": page_mm, "board": board }));
+        say(
+            serde_json::json!({ "out": args.out, "description": description, "page_mm": page_mm, "board": board }),
+        );
     } else {
         say(format_args!("{}: {}, {} x {} mm", args.out.display(), board.summary(), page_mm[0], page_mm[1]));
         say(format_args!("{}: its description, for --board", description.display()));

@@ -38,5 +38,10 @@ pub fn run(args: &Args, json: bool) -> Result<u8, Failure> {
         let picture = read_picture(path)?;
         views.add(&name_of(path, &args.images), &board, &picture, None, DetectSettings::default())?;
     }
-    result::solve(&Subject { board: &board, views: &views, gates, baseline_mm: None }, writer, &args.out, json)
+    result::solve(
+        &Subject { board: &board, views: &views, gates, baseline_mm: None },
+        writer,
+        &args.out,
+        json,
+    )
 }

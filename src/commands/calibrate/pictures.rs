@@ -52,7 +52,8 @@ impl Canvas {
         let steps = (dx.abs().max(dy.abs()) * self.scale).ceil().clamp(1.0, 4.0 * MOST_PX);
         for step in 0..=steps as u32 {
             let share = f64::from(step) / steps;
-            let [x, y] = [from[0] + share * dx, from[1] + share * dy].map(|value| (value * self.scale).round());
+            let [x, y] =
+                [from[0] + share * dx, from[1] + share * dy].map(|value| (value * self.scale).round());
             self.put(x as i64, y as i64, colour);
         }
     }
@@ -81,7 +82,9 @@ pub fn residuals(views: &[View], calibrated: &Calibrated) -> RgbImage {
     for (number, (view, pose)) in views.iter().zip(&calibrated.boards).enumerate() {
         for corner in &view.corners {
             let [x, y] = corner.board_mm;
-            let Some(expected) = lens.project(&pose.transform(&nalgebra::Vector3::new(x, y, 0.0))) else { continue };
+            let Some(expected) = lens.project(&pose.transform(&nalgebra::Vector3::new(x, y, 0.0))) else {
+                continue;
+            };
             let at = corner.camera_px;
             let end = [0, 1].map(|axis| at[axis] + EXAGGERATION * (expected[axis] - at[axis]));
             canvas.line(at, end, colour(number, views.len()));

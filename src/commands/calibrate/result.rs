@@ -15,7 +15,7 @@ use crate::{
     },
     commands::{failure::FAILED, say},
     engine::Failure,
-    geometry::{Calibration, Lens},
+    geometry::Calibration,
     store::{BundleWriter, error::StorageError, time::rfc3339_utc},
 };
 
@@ -89,7 +89,7 @@ pub fn solve(subject: &Subject<'_>, writer: BundleWriter, out: &Path, json: bool
     if let Ok(calibrated) = &result {
         let calibration = dated(calibrated);
         writer.bytes("calibration.toml", calibration.to_toml().as_bytes()).map_err(failed)?;
-        writer.bytes("opencv.yaml", opencv_yaml(&calibration).as_bytes()).map_err(failed)?;
+        writer.bytes("opencv.yaml", calibration.to_opencv_yaml().as_bytes()).map_err(failed)?;
         writer.png("residuals.png", &pictures::residuals(&views.views, calibrated)).map_err(failed)?;
         files.splice(0..0, ["calibration.toml", "opencv.yaml", "residuals.png"]);
     }
@@ -164,7 +164,11 @@ fn lines(views: &Views, result: &Result<Calibrated, Refused>, missing: &[String]
             ));
         }
         let projector = report.projector_rms_px.map(|rms| format!(", projector {rms:.3} px"));
-        lines.push(format!("reprojection: camera {:.3} px{}", report.camera_rms_px, projector.unwrap_or_default()));
+        lines.push(format!(
+            "reprojection: camera {:.3} px{}",
+            report.camera_rms_px,
+            projector.unwrap_or_default()
+        ));
     }
     match result {
         Ok(_) => lines.push("accepted".into()),
@@ -174,48 +178,4 @@ fn lines(views: &Views, result: &Result<Calibrated, Refused>, missing: &[String]
         }
     }
     lines
-}
-
-/// The calibration as OpenCV's FileStorage, in the names of its stereo samples.
-fn opencv_yaml(calibration: &Calibration) -> String {
-    let array = |name: &str, rows: usize, columns: usize, values: &[f64]| {
-        let values: Vec<String> = values.iter().map(|value| format!("{value:e}")).collect();
-        format!(
-            "{name}: !!opencv-matrix\n   rows: {rows}\n   cols: {columns}\n   dt: d\n   data: [ {} ]\n",
-            values.join(", ")
-        )
-    };
-    let rows = |matrix: &nalgebra::Matrix3<f64>| matrix.transpose().as_slice().to_vec();
-    let lens = |number: u8, lens: &Lens| {
-        array(&format!("cameraMatrix{number}"), 3, 3, &rows(&lens.matrix()))
-            + &array(&format!("distCoeffs{number}"), 1, 5, &lens.distortion)
-    };
-    let size = |number: u8, (width, height): (u32, u32)| format!("imageSize{number}: [ {width}, {height} ]\n");
-    let mut text = "%YAML:1.0\n---\n".to_owned();
-    text += &size(1, calibration.camera.size());
-    text += &lens(1, &calibration.camera);
-    if let Some(projector) = &calibration.projector {
-        text += &size(2, projector.lens.size());
-        text += &lens(2, &projector.lens);
-        let pose = &projector.projector_from_camera;
-        text += &array("R", 3, 3, &rows(&pose.rotation));
-        text += &array("T", 3, 1, pose.translation_mm.as_slice());
-    }
-    text
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::geometry::ReadHints;
-
-    #[test]
-    fn what_is_written_for_opencv_reads_as_the_same_calibration() {
-        let text = std::fs::read("config/sim-calibration.toml").unwrap();
-        let calibration = Calibration::from_bytes(&text, "a.toml", &ReadHints::default()).unwrap();
-        let yaml = opencv_yaml(&calibration);
-        let again = Calibration::from_bytes(yaml.as_bytes(), "opencv.yaml", &ReadHints::default()).unwrap();
-        assert_eq!(again.camera, calibration.camera);
-        assert_eq!(again.projector, calibration.projector);
-    }
 }

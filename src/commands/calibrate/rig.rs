@@ -72,7 +72,9 @@ pub fn run(
     let mut board = match (&args.board, &session) {
         (Some(path), _) => board::read(path, args.measured_mm)?,
         (None, Some(session)) => session.board.clone(),
-        (None, None) => return Err(Failure::data(OPERATION, "no board is given: give its file with --board")),
+        (None, None) => {
+            return Err(Failure::data(OPERATION, "no board is given: give its file with --board"));
+        }
     };
     board.measured_mm = args.measured_mm.or(board.measured_mm);
     let gates = args.limits.given()?.or(session.as_ref().map(|session| session.gates)).unwrap_or_default();
@@ -80,7 +82,8 @@ pub fn run(
         Some(poses) => {
             let settings = load(args.config.as_deref())?;
             let keep = args.session.as_deref();
-            Taking { board: &board, gates, baseline_mm: args.limits.baseline_mm, keep }.all(&settings, poses)?
+            Taking { board: &board, gates, baseline_mm: args.limits.baseline_mm, keep }
+                .all(&settings, poses)?
         }
         None => {
             let paths = match (&session, &args.session) {
@@ -169,7 +172,8 @@ impl Taking<'_> {
         if let (Some(last), true) = (views.unusable.last(), views.views.len() + 1 < number as usize) {
             writeln!(stderr, "view {} cannot be used: {}", last.name, last.reason).map_err(failed)?;
         }
-        writeln!(stderr, "view {number} of {of}: place the board, keep it still and press Enter").map_err(failed)?;
+        writeln!(stderr, "view {number} of {of}: place the board, keep it still and press Enter")
+            .map_err(failed)?;
         let read = std::io::stdin().lock().read_line(&mut String::new()).map_err(failed)?;
         if read == 0 {
             return Err(Failure::data(OPERATION, "the input ended before all views were taken"));

@@ -108,7 +108,8 @@ impl Views {
         settings: DetectSettings,
     ) -> Result<(), Failure> {
         let operation = || format!("read the view {}", path.display());
-        let bundle = Bundle::open(path, Policy::Local, None).map_err(|error| Failure::data(operation(), error))?;
+        let bundle =
+            Bundle::open(path, Policy::Local, None).map_err(|error| Failure::data(operation(), error))?;
         let mode = bundle.manifest().mode;
         if mode.is_some_and(|mode| mode != Mode::Gray) {
             let message = "it is no scan in mode gray: boards scatter light, which only intensities decode; \
@@ -126,9 +127,11 @@ impl Views {
         let recorded = Recorded::read(&request, bundle)?;
         // What a calibration says of these frames is what is to be found out.
         let job = pipeline::Job { calibration: None, ..recorded.job() };
-        let outcome = pipeline::run(&job).map_err(|error: PipelineError| Failure::data(operation(), error))?;
+        let outcome =
+            pipeline::run(&job).map_err(|error: PipelineError| Failure::data(operation(), error))?;
         self.set_projector(name, (job.decode.column.size(), job.decode.row.size()))?;
-        let Some(picture) = white_picture(job.roles, job.planes, (job.decode.width, job.decode.height)) else {
+        let Some(picture) = white_picture(job.roles, job.planes, (job.decode.width, job.decode.height))
+        else {
             return Err(Failure::data(operation(), "it has no white frame to find the board in; record one"));
         };
         self.add(name, board, &picture, Some(&outcome.decoded), settings)
@@ -149,13 +152,21 @@ impl Views {
 }
 
 /// Mean of the white frames.
-pub fn white_picture(roles: &[Role], planes: &[SharedPlane], (width, height): (usize, usize)) -> Option<Picture> {
+pub fn white_picture(
+    roles: &[Role],
+    planes: &[SharedPlane],
+    (width, height): (usize, usize),
+) -> Option<Picture> {
     let white: Vec<_> = roles.iter().zip(planes).filter(|(role, _)| **role == Role::White).collect();
     let mut sum = vec![0.0f32; width * height];
     for (_, plane) in &white {
         match plane.plane() {
-            Plane::U8(values) => sum.iter_mut().zip(values).for_each(|(sum, value)| *sum += f32::from(*value)),
-            Plane::U16(values) => sum.iter_mut().zip(values).for_each(|(sum, value)| *sum += f32::from(*value)),
+            Plane::U8(values) => {
+                sum.iter_mut().zip(values).for_each(|(sum, value)| *sum += f32::from(*value))
+            }
+            Plane::U16(values) => {
+                sum.iter_mut().zip(values).for_each(|(sum, value)| *sum += f32::from(*value))
+            }
         }
     }
     let count = white.len() as f32;
