@@ -85,22 +85,23 @@ fn held(print: &Cells, board: &Board, description: &RigDescription, number: u32)
     let fitting = size[0].max(size[1]) * camera.focal_px / (FILLS * width.min(height));
     let aimed = description.pose.aim_mm.unwrap_or(DISTANCE_MM);
     let distance = fitting.clamp(0.75 * aimed, 1.25 * aimed) * [1.0, 1.06, 0.95][number as usize % 3];
-    // Around the image by quarters, every fifth in the middle.
+    let roll = (f64::from(number * 37 % 60) - 30.0).to_radians() * 0.5;
+    // Around the image by quarters, as far out as the whole board is still seen; every fifth in the middle.
     let [across, down] =
         [[-1.0, -1.0], [1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [0.0, 0.0]][number as usize % 5];
-    let share = 0.5 * (1.0 - FILLS);
+    let (sin, cos) = (roll.sin().abs(), roll.cos());
+    let scale = camera.focal_px / distance;
+    let room = |side: f64, board_mm: f64| 0.45 * (side - scale * board_mm).max(0.0);
     let centre = camera.principal_point_px.unwrap_or([0.5 * (width - 1.0), 0.5 * (height - 1.0)]);
-    let at = [centre[0] + across * share * height, centre[1] + down * share * height * 0.8];
-    let middle = Vector3::new(
-        (at[0] - centre[0]) / camera.focal_px * distance,
-        (at[1] - centre[1]) / camera.focal_px * distance,
-        distance,
-    );
+    let at = [
+        centre[0] + across * room(width, size[0] * cos + size[1] * sin),
+        centre[1] + down * room(height, size[0] * sin + size[1] * cos),
+    ];
+    let middle = Vector3::new((at[0] - centre[0]) / scale, (at[1] - centre[1]) / scale, distance);
     // Seven directions of tilt against five places: no two views of a session are alike before the 35th.
     let direction = std::f64::consts::TAU * f64::from(number % 7) / 7.0;
     let tilt = TILT_DEG.to_radians() * if number % 5 == 4 { 0.6 } else { 1.0 };
     let axis = nalgebra::Unit::new_normalize(Vector3::new(direction.cos(), direction.sin(), 0.0));
-    let roll = (f64::from(number * 37 % 60) - 30.0).to_radians() * 0.5;
     let turned =
         Rotation3::from_axis_angle(&axis, tilt) * Rotation3::from_axis_angle(&Vector3::z_axis(), roll);
     let [right, down, normal] = [Vector3::x(), Vector3::y(), -Vector3::z()].map(|axis| turned * axis);

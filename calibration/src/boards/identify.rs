@@ -27,7 +27,7 @@ pub(super) enum Mismatch {
 }
 
 /// Rotates by quarter turns: what the board's axes make of a lattice's.
-fn turned([x, y]: [i32; 2], quarter: usize) -> [i32; 2] {
+pub(super) fn turned([x, y]: [i32; 2], quarter: usize) -> [i32; 2] {
     match quarter % 4 {
         0 => [x, y],
         1 => [y, -x],
