@@ -6,7 +6,7 @@ use nalgebra::Matrix3;
 
 use super::{
     description::Circles,
-    identify::{bounds, homography, project},
+    identify::{bounds, homography, project, turned},
     picture::Picture,
 };
 
@@ -202,14 +202,8 @@ fn number(board: &Circles, discs: &[Disc], lattice: &HashMap<[i32; 2], usize>) -
     let [low, _] = bounds(cells.iter().copied())?;
     let mut best: Option<(f64, Vec<(usize, u32)>)> = None;
     for quarter in 0..4 {
-        let turn = |[x, y]: [i32; 2]| match quarter {
-            0 => [x, y],
-            1 => [y, -x],
-            2 => [-x, -y],
-            _ => [-y, x],
-        };
         let found: HashMap<[i32; 2], usize> =
-            lattice.iter().map(|(&cell, &disc)| (turn(cell), disc)).collect();
+            lattice.iter().map(|(&cell, &disc)| (turned(cell, quarter), disc)).collect();
         let [least, _] = bounds(found.keys().copied())?;
         let place =
             |cell: &[i32; 2]| found.get(&[cell[0] - low[0] + least[0], cell[1] - low[1] + least[1]]).copied();
