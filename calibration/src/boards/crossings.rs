@@ -134,7 +134,7 @@ fn crossing(picture: &Picture, at: [f64; 2]) -> Option<Crossing> {
     }
     let &[(a, first_is_light), (b, _), (c, _), (d, _)] = edges.as_slice() else { return None };
     let straight = |one: f64, other: f64| (other - one - PI).abs() < MOST_BEND;
-    (straight(a, c) && straight(b, d)).then(|| Crossing {
+    (straight(a, c) && straight(b, d)).then_some(Crossing {
         at,
         edges: [a, b, c, d],
         first_is_light,

@@ -74,7 +74,7 @@ pub(super) fn checkerboard(
                     let right = right_edge(crossing, nodes, &cells, node, crossings);
                     let column = corner as i32 % inner[0];
                     let row = corner as i32 / inner[0];
-                    right.is_none_or(|edge| !crossing.light_after(edge + 2) == ((column + row) % 2 == 0))
+                    right.is_none_or(|edge| crossing.light_after(edge + 2) != ((column + row) % 2 == 0))
                 });
                 // Of equals the one whose first corner is nearest to the top left.
                 let first = known.iter().min_by_key(|&&(_, corner, _)| corner);
