@@ -11,9 +11,11 @@ use polscan_drivers::{
 };
 use thiserror::Error;
 
+mod held;
 mod replay;
 mod twin;
 
+pub use held::holding;
 pub use twin::without_analyser;
 
 use crate::{

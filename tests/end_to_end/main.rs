@@ -11,3 +11,4 @@ mod patterns;
 mod projection;
 mod refusals;
 mod rig;
+mod rig_calibration;

@@ -32,6 +32,7 @@ mod noise;
 mod optics;
 mod panel;
 mod polarization;
+mod print;
 mod projection;
 mod projector;
 mod render;
@@ -50,6 +51,7 @@ pub use description::{
     AmbientDescription, AnalyserDescription, CameraDescription, FlickerDescription, Pacing,
     PanelPolarization, PoseDescription, ProjectorDescription, RigDescription,
 };
+pub use print::Print;
 pub use projection::Projection;
 pub use projector::SimProjectors;
 pub use rig::{Rig, RigError, Truth, TruthObject};

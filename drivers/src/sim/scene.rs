@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{
     faults::Faults,
+    print::Print,
     surface::{Clip, Primitive, Shape as Solid},
 };
 
@@ -72,6 +73,8 @@ pub struct Object {
     pub level: Option<f64>,
     /// Name of an object with a level of its own that `level` refers to.
     pub level_of: Option<String>,
+    /// What is printed on it; only on a plane.
+    pub print: Option<Print>,
     /// Shape and place.
     pub shape: Shape,
 }
@@ -220,6 +223,12 @@ impl Scene {
             }
             if object.level.is_none() {
                 faults.add(&format!("{key}.level"), "is missing beside level_of");
+            }
+        }
+        if let Some(print) = &object.print {
+            print.validate(faults, &format!("{key}.print"));
+            if !matches!(object.shape, Shape::Plane(_)) {
+                faults.add(&format!("{key}.print"), "is on no plane");
             }
         }
         object.shape.validate(faults, &format!("{key}.shape"));

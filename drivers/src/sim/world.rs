@@ -10,6 +10,7 @@ use super::{
     optics::{Pinhole, Placement},
     panel::{Panel, reach_px},
     polarization::{Analyser, Ray, across},
+    print::Print,
     rig::RigError,
     scene::{Material, Scene},
     script::Bump,
@@ -91,6 +92,7 @@ struct Tracer<'a> {
     channels: [(f64, f64); 3],
     primitives: Vec<Primitive>,
     materials: Vec<&'a Material>,
+    prints: Vec<Option<&'a Print>>,
     seed: u64,
 }
 
@@ -162,6 +164,9 @@ impl World {
                 let pixel = [x as f64 - border as f64, y as f64 - border as f64];
                 let ray = tracer.camera.ray(pixel).ok_or(RigError::Lens { which: "camera" })?;
                 (*view, *sight) = tracer.look(ray);
+                if let Some(tone) = tracer.tone(pixel, ray, sight.face) {
+                    view.gain.iter_mut().for_each(|gain| *gain *= tone);
+                }
             }
             Ok(())
         })?;
@@ -276,6 +281,7 @@ impl<'a> Tracer<'a> {
             channels,
             primitives: scene.primitives(),
             materials,
+            prints: scene.objects.iter().map(|object| object.print.as_ref()).collect(),
             seed: description.seed,
         })
     }
@@ -342,6 +348,26 @@ impl<'a> Tracer<'a> {
         let [column, row] = [0, 1].map(|axis| self.panel.position(axis, at[axis]));
         let at = if within { at.map(|value| value as f32) } else { [f32::NAN; 2] };
         (View { gain, column, row }, Sight { at, ..dark.1 })
+    }
+
+    /// What a print leaves of the light of a pixel, whose whole area counts: edges of a print are measured to a
+    /// hundredth of it. `None` where nothing is printed.
+    fn tone(&self, pixel: [f64; 2], ray: Vector3<f64>, face: u8) -> Option<f32> {
+        let primitive = self.primitives.get(usize::from(face))?;
+        let print = self.prints[primitive.object]?;
+        let place = |ray: Vector3<f64>| {
+            let ray = self.turn * ray;
+            let distance = primitive.shape.meet(self.eye, ray)?;
+            Some(print.place(self.eye + ray * distance - primitive.shifted))
+        };
+        let middle = place(ray)?;
+        let step = |pixel: [f64; 2]| {
+            let at = self.camera.ray(pixel).and_then(place)?;
+            Some([at[0] - middle[0], at[1] - middle[1]])
+        };
+        let [x, y] = pixel;
+        let (right, below) = (step([x + 1.0, y]).unwrap_or_default(), step([x, y + 1.0]).unwrap_or_default());
+        Some(print.over(middle, right, below) as f32)
     }
 
     fn texture(&self, material: &Material, primitive: &Primitive, point: Vector3<f64>) -> f64 {

@@ -1,0 +1,47 @@
+//! `polscan calibrate camera`.
+
+use std::path::PathBuf;
+
+use super::{
+    board,
+    result::{self, Subject},
+    views::{Views, name_of, read_picture},
+};
+use crate::{calibration::boards::DetectSettings, engine::Failure};
+
+/// Arguments.
+#[derive(Debug, clap::Args)]
+pub struct Args {
+    /// Description of the board, as `polscan calibrate board` writes it.
+    #[arg(long, value_name = "FILE")]
+    board: PathBuf,
+    /// Measured length of the board's printed bar.
+    #[arg(long, value_name = "MM")]
+    measured_mm: Option<f64>,
+    /// Pictures of the board.
+    #[arg(long, value_name = "FILE", num_args = 1.., required = true)]
+    images: Vec<PathBuf>,
+    #[command(flatten)]
+    limits: result::Limits,
+    /// Folder for the result; must be absent or empty.
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+}
+
+/// Calibrates and writes; returns the exit code.
+pub fn run(args: &Args, json: bool) -> Result<u8, Failure> {
+    let writer = result::claim(&args.out)?;
+    let board = board::read(&args.board, args.measured_mm)?;
+    let gates = args.limits.given()?.unwrap_or_default();
+    let mut views = Views::default();
+    for path in &args.images {
+        let picture = read_picture(path)?;
+        views.add(&name_of(path, &args.images), &board, &picture, None, DetectSettings::default())?;
+    }
+    result::solve(
+        &Subject { board: &board, views: &views, gates, baseline_mm: None },
+        writer,
+        &args.out,
+        json,
+    )
+}

@@ -1,0 +1,181 @@
+//! From views to files: what a calibration came to, or why there is none.
+
+use std::{
+    path::{Path, PathBuf},
+    time::SystemTime,
+};
+
+use serde_json::{Value, json};
+
+use super::{pictures, views::Views};
+use crate::{
+    calibration::{
+        boards::Board,
+        rig::{Calibrated, Gates, Refused, Setup, calibrate, guidance},
+    },
+    commands::{failure::FAILED, say},
+    engine::Failure,
+    geometry::Calibration,
+    store::{BundleWriter, error::StorageError, time::rfc3339_utc},
+};
+
+/// Schema of the report.
+const SCHEMA: &str = "polscan.calibration-report/1";
+
+/// When a calibration is accepted.
+#[derive(Debug, clap::Args)]
+pub struct Limits {
+    /// File of limits that a calibration must keep, TOML; those it leaves out are the usual ones.
+    #[arg(long, value_name = "FILE")]
+    gates: Option<PathBuf>,
+    /// Distance between camera and projector as measured with a ruler: shows a board of another size.
+    #[arg(long, value_name = "MM")]
+    pub baseline_mm: Option<f64>,
+}
+
+impl Limits {
+    /// The limits; `None` where no file names any.
+    pub fn given(&self) -> Result<Option<Gates>, Failure> {
+        let Some(path) = &self.gates else { return Ok(None) };
+        let operation = format!("read the limits {}", path.display());
+        let text = std::fs::read_to_string(path).map_err(|error| Failure::data(operation.clone(), error))?;
+        toml::from_str(&text).map(Some).map_err(|error| Failure::data(operation, error))
+    }
+}
+
+/// Claims the folder of the result, before any work.
+pub fn claim(out: &Path) -> Result<BundleWriter, Failure> {
+    BundleWriter::create(out, None, 0).map_err(failed)
+}
+
+fn failed(error: StorageError) -> Failure {
+    Failure::storage("write the calibration", error)
+}
+
+/// What is calibrated, from what.
+pub struct Subject<'a> {
+    /// Board.
+    pub board: &'a Board,
+    /// What was seen of it.
+    pub views: &'a Views,
+    /// When it is accepted.
+    pub gates: Gates,
+    /// Distance between camera and projector, where it is known.
+    pub baseline_mm: Option<f64>,
+}
+
+/// Sizes and limits as the solver takes them.
+///
+/// # Errors
+/// Where no picture was seen at all.
+pub fn setup(views: &Views, gates: Gates, baseline_mm: Option<f64>) -> Result<Setup, Failure> {
+    let Some(camera) = views.camera else {
+        return Err(Failure::data("calibrate", "there is no view; give scans or pictures of the board"));
+    };
+    let setup = match views.projector {
+        Some(projector) => Setup::rig(camera, projector),
+        None => Setup::camera(camera),
+    };
+    Ok(Setup { gates, baseline_mm, ..setup })
+}
+
+/// Solves, writes everything and prints; returns the exit code.
+pub fn solve(subject: &Subject<'_>, writer: BundleWriter, out: &Path, json: bool) -> Result<u8, Failure> {
+    let Subject { board, views, .. } = *subject;
+    let setup = setup(views, subject.gates, subject.baseline_mm)?;
+    let result = calibrate(&views.views, &setup);
+    let mut files = vec!["report.json", "coverage.png"];
+    writer.png("coverage.png", &pictures::coverage(&views.views, setup.camera.size)).map_err(failed)?;
+    if let Ok(calibrated) = &result {
+        let calibration = dated(calibrated);
+        writer.bytes("calibration.toml", calibration.to_toml().as_bytes()).map_err(failed)?;
+        writer.bytes("opencv.yaml", calibration.to_opencv_yaml().as_bytes()).map_err(failed)?;
+        writer.png("residuals.png", &pictures::residuals(&views.views, calibrated)).map_err(failed)?;
+        files.splice(0..0, ["calibration.toml", "opencv.yaml", "residuals.png"]);
+    }
+    let missing = guidance(&views.views, &setup, None);
+    let report = report(subject, &result, &missing.missing, missing.views_missing);
+    let text = serde_json::to_vec_pretty(&report)
+        .map_err(|error| Failure::storage("write the calibration", error))?;
+    writer.bytes("report.json", &text).map_err(failed)?;
+    writer.finish_plain().map_err(failed)?;
+    if json {
+        say(json!({ "out": out, "accepted": result.is_ok(), "files": files, "report": report }));
+    } else {
+        say(format_args!("board: {}", board.summary()));
+        lines(views, &result, &missing.missing).iter().for_each(say);
+        say(format_args!("{} in {}", files.join(", "), out.display()));
+    }
+    Ok(if result.is_ok() { 0 } else { FAILED })
+}
+
+fn dated(calibrated: &Calibrated) -> Calibration {
+    let mut calibration = calibrated.calibration.clone();
+    calibration.quality.date = Some(rfc3339_utc(SystemTime::now()));
+    calibration
+}
+
+fn report(
+    subject: &Subject<'_>,
+    result: &Result<Calibrated, Refused>,
+    missing: &[String],
+    views_missing: usize,
+) -> Value {
+    let views = subject.views;
+    let (solution, refusals) = match result {
+        Ok(calibrated) => (Some(&calibrated.report), json!([])),
+        Err(refused) => (refused.report.as_deref(), json!(refused.refusals)),
+    };
+    json!({
+        "schema": SCHEMA,
+        "kind": if views.projector.is_some() { "rig" } else { "camera" },
+        "accepted": result.is_ok(),
+        "refusals": refusals,
+        "board": subject.board,
+        "gates": subject.gates,
+        "views": views.seen,
+        "unusable": views.unusable,
+        "missing": missing,
+        "views_missing": views_missing,
+        "solution": solution,
+    })
+}
+
+/// What a person reads.
+fn lines(views: &Views, result: &Result<Calibrated, Refused>, missing: &[String]) -> Vec<String> {
+    let mut lines: Vec<String> = views
+        .unusable
+        .iter()
+        .map(|unusable| format!("view {} cannot be used: {}", unusable.name, unusable.reason))
+        .collect();
+    let report = match result {
+        Ok(calibrated) => Some(&calibrated.report),
+        Err(refused) => refused.report.as_deref(),
+    };
+    if let Some(report) = report {
+        for view in &report.views {
+            let projector = view.projector_rms_px.map(|rms| format!(", projector {rms:.3} px"));
+            lines.push(format!(
+                "view {}: {} corners, camera {:.3} px{}",
+                view.name,
+                view.corners,
+                view.camera_rms_px,
+                projector.unwrap_or_default()
+            ));
+        }
+        let projector = report.projector_rms_px.map(|rms| format!(", projector {rms:.3} px"));
+        lines.push(format!(
+            "reprojection: camera {:.3} px{}",
+            report.camera_rms_px,
+            projector.unwrap_or_default()
+        ));
+    }
+    match result {
+        Ok(_) => lines.push("accepted".into()),
+        Err(refused) => {
+            lines.extend(refused.refusals.iter().map(|refusal| format!("refused: {}", refusal.message)));
+            lines.extend(missing.iter().map(|missing| format!("missing: {missing}")));
+        }
+    }
+    lines
+}
