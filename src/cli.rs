@@ -36,6 +36,9 @@ enum Command {
     Decode(Decode),
     /// Compare the paper's method, ordinary Gray code and pse on one scene, as one page and one file of figures.
     Compare(Compare),
+    /// Measure what the rig is like, for scans to use.
+    #[command(subcommand)]
+    Calibrate(commands::Calibrate),
     /// Write the pattern images as PNG, with the manifest that describes them.
     Patterns(Patterns),
     /// Run as a service with a REST interface.
@@ -282,6 +285,12 @@ fn dispatch(cli: &Cli) -> Result<u8, Failure> {
                 false => commands::CompareArgs::Bundles(bundles),
             };
             commands::compare(&what, &args.region, &args.out, cli.json)
+        }
+        Command::Calibrate(what) => {
+            let load = |file: Option<&Path>| {
+                layers(&ConfigArgs { config: file.map(Path::to_path_buf) }, Vec::new()).load()
+            };
+            commands::calibrate(what, load, cli.json)
         }
         Command::Patterns(args) => {
             let settings = layers(&args.config, Vec::new()).load()?;

@@ -1,6 +1,7 @@
 //! What each command of the program does: reads, calls the pure parts, writes, prints.
 
 mod admin;
+mod calibrate;
 mod check_config;
 mod compare;
 mod decode;
@@ -17,6 +18,7 @@ use std::{io::Write, path::Path};
 use crate::report::{self, Outputs, Report, Verdict};
 
 pub use admin::{add_token, list_tokens, openapi, reindex, revoke_token};
+pub use calibrate::{Calibrate, calibrate};
 pub use check_config::check_config;
 pub use compare::{CompareArgs, compare};
 pub use decode::decode;

@@ -97,6 +97,8 @@ pub struct Rig {
     pub calibration_unit_mm: f64,
     /// H over V that the rig shows on metal; 0 is unknown.
     pub extinction_ratio: f64,
+    /// File of the camera's measured noise, relative to the configuration file; empty for none.
+    pub noise: String,
 }
 
 /// `[volume]`

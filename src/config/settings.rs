@@ -15,7 +15,10 @@ use super::{
     layers::read_text,
     raw::{self, DeviceDriver, Raw},
 };
-use crate::decode::Thresholds;
+use crate::{
+    decode::Thresholds,
+    measure::files::{self, Document, RigFiles},
+};
 
 /// Where the calibration of the rig comes from.
 #[derive(Debug, Clone, PartialEq)]
@@ -53,6 +56,8 @@ pub struct Settings {
     pub tokens: Option<PathBuf>,
     /// Files of certificate and key, resolved against the folder of the configuration.
     pub tls: Option<(PathBuf, PathBuf)>,
+    /// What was measured of the rig.
+    pub measured: RigFiles,
 }
 
 impl Settings {
@@ -77,6 +82,7 @@ impl Settings {
         let tokens = (!raw.api.tokens.is_empty()).then(|| folder.join(&raw.api.tokens));
         let listen = listen(&raw.api, tokens.is_some(), faults);
         let tls = tls(&raw.api, folder, faults);
+        let measured = RigFiles { noise: measured(&raw.rig.noise, folder, faults) };
         if !faults.is_empty() {
             return None;
         }
@@ -103,6 +109,7 @@ impl Settings {
             listen: listen?,
             tokens,
             tls,
+            measured,
             raw,
         })
     }
@@ -251,6 +258,14 @@ fn calibration(rig: &raw::Rig, folder: &Path, faults: &mut Faults) -> Option<Rig
         path,
         projector_left: rig.calibration_projector_left,
         unit_mm: rig.calibration_unit_mm,
+    })
+}
+
+/// A file of what was measured.
+fn measured<T: Document>(name: &str, folder: &Path, faults: &mut Faults) -> Option<T> {
+    files::load(name, folder, read_text).unwrap_or_else(|fault| {
+        faults.push((T::KEY.into(), fault));
+        None
     })
 }
 

@@ -1,0 +1,86 @@
+//! Where a calibration goes: a folder with a file for scans, a report and plots, and a few lines for a person.
+
+use std::path::Path;
+
+use serde_json::Value;
+
+use crate::{
+    commands::{failure::FAILED, say},
+    compare::plot::{Plot, Series},
+    engine::Failure,
+    measure::files::Document,
+    store::{BundleWriter, StorageError},
+};
+
+/// The folder that a calibration is written to.
+pub struct Output {
+    writer: BundleWriter,
+    files: Vec<String>,
+}
+
+/// What a calibration came to, in words.
+pub struct Summary {
+    /// Lines for a person.
+    pub lines: Vec<String>,
+    /// Why no file for scans was written; `None` where one was.
+    pub refused: Option<String>,
+}
+
+impl Output {
+    /// Claims the folder, before the rig is touched.
+    pub fn create(out: &Path) -> Result<Self, Failure> {
+        let writer = BundleWriter::create(out, None, 0).map_err(failed)?;
+        Ok(Self { writer, files: Vec::new() })
+    }
+
+    /// Adds a file.
+    pub fn add(&mut self, name: &str, bytes: &[u8]) -> Result<(), Failure> {
+        self.writer.bytes(name, bytes).map_err(failed)?;
+        self.files.push(name.into());
+        Ok(())
+    }
+
+    /// Adds the file that scans use.
+    pub fn document<T: Document>(&mut self, file: &T) -> Result<(), Failure> {
+        self.add(T::FILE_NAME, file.to_toml().as_bytes())
+    }
+
+    /// Adds a plot.
+    pub fn plot(&mut self, name: &str, plot: &Plot) -> Result<(), Failure> {
+        self.add(name, plot.file().as_bytes())
+    }
+
+    /// Adds report.json, closes the folder, prints, and returns the exit code.
+    pub fn finish(
+        mut self,
+        out: &Path,
+        report: &Value,
+        summary: &Summary,
+        json: bool,
+    ) -> Result<u8, Failure> {
+        let text = serde_json::to_vec_pretty(report).expect("numbers and text are JSON");
+        self.add("report.json", &text)?;
+        self.writer.finish_plain().map_err(failed)?;
+        if json {
+            say(
+                serde_json::json!({ "out": out, "files": self.files, "refused": summary.refused, "report": report }),
+            );
+        } else {
+            summary.lines.iter().for_each(say);
+            if let Some(refused) = &summary.refused {
+                say(format_args!("refused: {refused}"));
+            }
+            say(format_args!("{} in {}", self.files.join(", "), out.display()));
+        }
+        Ok(if summary.refused.is_some() { FAILED } else { 0 })
+    }
+}
+
+fn failed(error: StorageError) -> Failure {
+    Failure::storage("write the calibration", error)
+}
+
+/// A named line or set of dots of a plot.
+pub fn series(name: &str, class: &'static str, joined: bool, points: Vec<(f64, f64)>) -> Series {
+    Series { name: name.into(), class, points, joined }
+}
