@@ -99,6 +99,10 @@ pub struct Rig {
     pub extinction_ratio: f64,
     /// File of the camera's measured noise, relative to the configuration file; empty for none.
     pub noise: String,
+    /// File of the projector's measured timing, likewise.
+    pub sync: String,
+    /// File of the measured polarization, likewise.
+    pub polarization: String,
 }
 
 /// `[volume]`

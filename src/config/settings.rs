@@ -63,7 +63,8 @@ pub struct Settings {
 impl Settings {
     /// H over V that the rig shows on metal, where it is known.
     pub fn extinction_ratio(&self) -> Option<f64> {
-        Some(self.raw.rig.extinction_ratio).filter(|&ratio| ratio > 0.0)
+        let configured = Some(self.raw.rig.extinction_ratio).filter(|&ratio| ratio > 0.0);
+        configured.or_else(|| Some(self.measured.polarization.as_ref()?.extinction_ratio))
     }
 }
 
@@ -82,7 +83,11 @@ impl Settings {
         let tokens = (!raw.api.tokens.is_empty()).then(|| folder.join(&raw.api.tokens));
         let listen = listen(&raw.api, tokens.is_some(), faults);
         let tls = tls(&raw.api, folder, faults);
-        let measured = RigFiles { noise: measured(&raw.rig.noise, folder, faults) };
+        let measured = RigFiles {
+            noise: measured(&raw.rig.noise, folder, faults),
+            sync: measured(&raw.rig.sync, folder, faults),
+            polarization: measured(&raw.rig.polarization, folder, faults),
+        };
         if !faults.is_empty() {
             return None;
         }

@@ -131,6 +131,16 @@ impl Scan {
             .measured
             .camera(&camera, applied)
             .map_err(|stale| setup("use the measured noise", stale))?;
+        let projector = settings
+            .measured
+            .projector(projector)
+            .map_err(|stale| setup("use the measured timing", stale))?;
+        if let Some(polarization) = &settings.measured.polarization {
+            let channels = [settings.raw.projector.horizontal.as_str(), &settings.raw.projector.vertical];
+            polarization
+                .check(&camera, &projector, channels)
+                .map_err(|stale| setup("use the measured polarization", stale))?;
+        }
         let size = ProjectorSize { width: projector.width, height: projector.height };
         let sequence =
             Sequence::new(settings.mode, size).map_err(|e| Failure::data("make the patterns", e))?;

@@ -10,13 +10,19 @@ use polscan_drivers::{
     projector::{PresentReceipt, ProjectorInfo, Slide},
 };
 
-use crate::{app::Rig, engine::Failure, sequencer::CancelFlag};
+use crate::{app::Rig, decode::NoiseModel, engine::Failure, sequencer::CancelFlag};
 
 /// From flip to steady light of a projector that was not measured: slower ones have not been seen.
 const UNMEASURED: Duration = Duration::from_millis(300);
 
 /// How much later than computed a frame may come.
 const SLACK: Duration = Duration::from_millis(500);
+
+/// Time that a camera needs between readout and the next exposure, generously.
+const TURNAROUND: Duration = Duration::from_millis(1);
+
+/// Electrons of a full pixel of a common sensor.
+const USUAL_FULL_WELL_E: f64 = 10_000.0;
 
 /// Rig in use for a measurement. Dropping it stops the camera and leaves the projector black.
 pub struct Bench<'a> {
@@ -81,6 +87,30 @@ impl<'a> Bench<'a> {
         Ok(())
     }
 
+    /// Time on the rig's clock.
+    pub fn now(&self) -> Timestamp {
+        self.rig.clock.now()
+    }
+
+    /// Least time from one exposure to the next.
+    pub fn frame_interval(&self) -> Duration {
+        let frame_us =
+            self.applied.as_ref().map_or(0.0, |applied| applied.settings.exposure_us + applied.readout_us);
+        Duration::from_secs_f64(1e-6 * frame_us) + TURNAROUND
+    }
+
+    /// Noise of the camera as it says, else that of a good one: for weights only.
+    pub fn noise(&self) -> NoiseModel {
+        let applied = self.applied.as_ref();
+        let said = applied.and_then(|applied| applied.noise);
+        let full_dn = applied.map_or(255.0, |applied| f64::from(applied.saturation_dn));
+        NoiseModel {
+            gain_dn_per_electron: said
+                .map_or(full_dn / USUAL_FULL_WELL_E, |noise| noise.gain_dn_per_electron),
+            read_noise_dn: said.map_or(1.0, |noise| noise.read_noise_dn),
+        }
+    }
+
     /// Waits until `time` on the rig's clock.
     pub fn wait_until(&self, time: Timestamp) {
         self.rig.clock.sleep_until(time);
@@ -99,10 +129,9 @@ impl<'a> Bench<'a> {
     /// One frame, exposed at `at` or as soon after it as can be.
     pub fn take(&mut self, at: Timestamp) -> Result<Frame, Failure> {
         self.check_cancelled()?;
-        let frame_us =
-            self.applied.as_ref().map_or(0.0, |applied| applied.settings.exposure_us + applied.readout_us);
+        let frame = self.frame_interval();
         self.rig.camera.trigger(at).map_err(|error| self.failed(error))?;
-        let timeout = at.since(self.rig.clock.now()) + Duration::from_secs_f64(1e-6 * frame_us) + SLACK;
+        let timeout = at.since(self.rig.clock.now()) + frame + SLACK;
         self.rig.camera.next_frame(timeout).map_err(|error| self.failed(error))
     }
 

@@ -1,11 +1,20 @@
 //! What was measured of a rig, in files that a scan uses. Each says which device and settings it is for, and is refused
 //! by name with any other.
 
-use std::{fmt, path::Path};
+use std::{fmt, path::Path, time::Duration};
 
-use polscan_drivers::camera::{AppliedSettings, CameraInfo, CameraNoise, PixelFormat};
+use polscan_calibration::{
+    polarization::{Channel, Field},
+    synchrony::{BandTiming, Ripple, Timing},
+};
+use polscan_drivers::{
+    camera::{AppliedSettings, CameraInfo, CameraNoise, PixelFormat},
+    projector::{ProjectorInfo, ProjectorTiming},
+};
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
 use thiserror::Error;
+
+use super::polarization::Drive;
 
 /// A file for another device or other settings than the rig's.
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
@@ -83,6 +92,12 @@ pub struct DeviceKey {
 
 impl From<&CameraInfo> for DeviceKey {
     fn from(info: &CameraInfo) -> Self {
+        Self { driver: info.driver.clone(), model: info.model.clone(), serial: info.serial.clone() }
+    }
+}
+
+impl From<&ProjectorInfo> for DeviceKey {
+    fn from(info: &ProjectorInfo) -> Self {
         Self { driver: info.driver.clone(), model: info.model.clone(), serial: info.serial.clone() }
     }
 }
@@ -183,11 +198,175 @@ impl NoiseFile {
     }
 }
 
+/// What a projector shows when it is measured: another picture size or refresh rate has another timing.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct DisplayMode {
+    /// Columns.
+    pub width: u32,
+    /// Rows.
+    pub height: u32,
+    /// Time between refreshes.
+    pub refresh_period_ms: f64,
+}
+
+impl From<&ProjectorInfo> for DisplayMode {
+    fn from(info: &ProjectorInfo) -> Self {
+        let refresh_period_ms = 1e3 * info.refresh_period.as_secs_f64();
+        Self { width: info.width, height: info.height, refresh_period_ms }
+    }
+}
+
+impl fmt::Display for DisplayMode {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}x{} at {:.2} Hz", self.width, self.height, 1e3 / self.refresh_period_ms)
+    }
+}
+
+/// Trigger delay and hold of a scan.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Chosen {
+    /// Exposure time for which they are.
+    pub exposure_us: f64,
+    /// From flip to exposure.
+    pub trigger_delay_ms: f64,
+    /// Refreshes for which each picture is held.
+    pub hold_refreshes: u32,
+    /// From this delay on ...
+    pub safe_from_ms: f64,
+    /// ... to this one, held so long, the light is steady.
+    pub safe_until_ms: f64,
+}
+
+/// `sync.toml`: what `polscan calibrate sync` found.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SyncFile {
+    /// `polscan.sync/1`.
+    pub schema: String,
+    /// When it was measured, RFC 3339.
+    pub created: String,
+    /// Projector.
+    pub projector: DeviceKey,
+    /// What it showed.
+    pub mode: DisplayMode,
+    /// Measured timing.
+    pub timing: Timing,
+    /// What a scan with the configured exposure makes of it.
+    pub chosen: Chosen,
+    /// The lamp, where the light was enough to tell.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub ripple: Option<Ripple>,
+    /// Timing of each channel in bands of the picture's height.
+    pub bands: Vec<BandTiming>,
+}
+
+impl Document for SyncFile {
+    const SCHEMA: &'static str = "polscan.sync/1";
+    const FILE_NAME: &'static str = "sync.toml";
+    const WHAT: &'static str = "projector's timing";
+    const COMMAND: &'static str = "sync";
+    const KEY: &'static str = "rig.sync";
+
+    fn schema(&self) -> &str {
+        &self.schema
+    }
+}
+
+impl SyncFile {
+    /// What a projector says of itself, with the measured timing where it states none.
+    ///
+    /// # Errors
+    /// Where the timing was measured with another projector or picture.
+    pub fn amend(&self, mut projector: ProjectorInfo) -> Result<ProjectorInfo, Stale> {
+        Self::same("the projector", &self.projector, &(&projector).into())?;
+        let mode = |mode: DisplayMode| mode.to_string();
+        Self::same("a picture of", &mode(self.mode), &mode((&projector).into()))?;
+        // Numbers of a file may be anything.
+        let duration = |ms: f64| Duration::try_from_secs_f64(1e-3 * ms).unwrap_or_default();
+        projector.timing.get_or_insert(ProjectorTiming {
+            latency: duration(self.timing.latency_ms),
+            settling: duration(self.timing.settling_ms),
+        });
+        Ok(projector)
+    }
+}
+
+/// `polarization.toml`: what `polscan calibrate polarization` found.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PolarizationFile {
+    /// `polscan.polarization/1`.
+    pub schema: String,
+    /// When it was measured, RFC 3339.
+    pub created: String,
+    /// Letters of the channels that carry H, and V, as found.
+    pub horizontal: String,
+    /// See `horizontal`.
+    pub vertical: String,
+    /// How many times brighter than V the rig shows H on metal, the polarizer where it stood best.
+    pub extinction_ratio: f64,
+    /// How far the polarizer's axis stands from H where its mount reads 0, counter-clockwise as the camera sees it.
+    pub azimuth_error_deg: f64,
+    /// Its sigma.
+    pub azimuth_sigma_deg: f64,
+    /// Light of the black picture as a share of white.
+    pub black_share: f64,
+    /// Camera.
+    pub camera: DeviceKey,
+    /// Projector.
+    pub projector: DeviceKey,
+    /// Code values at which a white card returns H and V alike.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub drive: Option<Drive>,
+    /// Misregistration of V against H.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub misregistration: Option<Field>,
+    /// Red, green, blue.
+    pub channels: [Channel; 3],
+}
+
+impl Document for PolarizationFile {
+    const SCHEMA: &'static str = "polscan.polarization/1";
+    const FILE_NAME: &'static str = "polarization.toml";
+    const WHAT: &'static str = "polarization";
+    const COMMAND: &'static str = "polarization";
+    const KEY: &'static str = "rig.polarization";
+
+    fn schema(&self) -> &str {
+        &self.schema
+    }
+}
+
+impl PolarizationFile {
+    /// Whether the file is for these devices, and these channels.
+    ///
+    /// # Errors
+    /// Where it is for others.
+    pub fn check(
+        &self,
+        camera: &CameraInfo,
+        projector: &ProjectorInfo,
+        [horizontal, vertical]: [&str; 2],
+    ) -> Result<(), Stale> {
+        Self::same("the camera", &self.camera, &camera.into())?;
+        Self::same("the projector", &self.projector, &projector.into())?;
+        let letters = |text: &str| "rgb".chars().filter(|letter| text.contains(*letter)).collect::<String>();
+        Self::same("horizontal channels", &letters(&self.horizontal), &letters(horizontal))?;
+        Self::same("vertical channels", &letters(&self.vertical), &letters(vertical))
+    }
+}
+
 /// All that was measured of a rig, as far as the configuration names it.
 #[derive(Debug, Clone, Default)]
 pub struct RigFiles {
     /// The camera's noise.
     pub noise: Option<NoiseFile>,
+    /// The projector's timing.
+    pub sync: Option<SyncFile>,
+    /// What becomes of polarized light.
+    pub polarization: Option<PolarizationFile>,
 }
 
 impl RigFiles {
@@ -199,6 +378,17 @@ impl RigFiles {
         match &self.noise {
             Some(noise) => noise.amend(camera, applied),
             None => Ok(applied),
+        }
+    }
+
+    /// What the projector says of itself, with what was measured of it.
+    ///
+    /// # Errors
+    /// Where it was measured with another projector or picture.
+    pub fn projector(&self, projector: ProjectorInfo) -> Result<ProjectorInfo, Stale> {
+        match &self.sync {
+            Some(sync) => sync.amend(projector),
+            None => Ok(projector),
         }
     }
 }

@@ -4,5 +4,7 @@
 mod bench;
 pub mod files;
 pub mod noise;
+pub mod polarization;
+pub mod sync;
 
 pub use bench::Bench;

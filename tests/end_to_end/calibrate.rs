@@ -17,7 +17,8 @@ fn number(file: &Table, path: &str) -> f64 {
 /// A TOML file in the rig's folder.
 fn table(rig: &Rig, name: &str) -> Table {
     let path = rig.path(name);
-    let content = std::fs::read_to_string(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
+    let content =
+        std::fs::read_to_string(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
     content.parse().unwrap()
 }
 
@@ -52,7 +53,11 @@ fn noise_of_the_camera_is_found_at_every_bit_depth_and_used_by_scans() {
     let measured = number(&table(&rig, "noise-5/noise.toml"), "noise.gain_dn_per_electron");
     assert_eq!(manifest["camera"]["gain_dn_per_electron"].as_f64(), Some(measured), "{manifest}");
     let refused = rig.set("camera.gain_db", 6.0).scan("other", &[]).expect(64);
-    assert!(refused.stderr.contains("a gain in dB of 0") && refused.stderr.contains("rig.noise"), "{}", refused.stderr);
+    assert!(
+        refused.stderr.contains("a gain in dB of 0") && refused.stderr.contains("rig.noise"),
+        "{}",
+        refused.stderr
+    );
 }
 
 #[test]
@@ -71,4 +76,168 @@ fn a_file_that_is_none_is_refused_with_its_key() {
     let rig = Rig::scaled(8.0).set("rig.noise", "sim-calibration.toml");
     let refused = rig.scan("scan", &[]).expect(64);
     assert!(refused.stderr.contains("rig.noise") && refused.stderr.contains("polscan calibrate noise"));
+}
+
+#[test]
+fn timing_of_the_projector_is_found_and_used_where_the_driver_states_none() {
+    let cases = [(0, 6.0), (2, 6.0), (3, 12.0)];
+    let mut rig = Rig::scaled(8.0).set("sim.projector.states_timing", false);
+    for (latency_refreshes, lcd_ms) in cases {
+        rig = rig
+            .set("sim.seed", 7 + latency_refreshes)
+            .set("sim.projector.latency_refreshes", latency_refreshes)
+            .set("sim.projector.lcd_10_90_ms", lcd_ms);
+        let out = format!("sync-{latency_refreshes}");
+        calibrate(&rig, "sync", &out, &[]).expect(0);
+        let file = table(&rig, &format!("{out}/sync.toml"));
+        let latency_ms = latency_refreshes as f64 * 1000.0 / 60.0;
+        let settling_ms = lcd_ms / 9f64.ln() * 1000f64.ln();
+        let context = format!("{latency_refreshes} refreshes, {lcd_ms} ms: {file}");
+        assert_eq!(file["timing"]["latency_refreshes"].as_integer(), Some(latency_refreshes), "{context}");
+        assert!((number(&file, "timing.latency_ms") - latency_ms).abs() <= 1.0, "{context}");
+        assert!((number(&file, "timing.settling_ms") - settling_ms).abs() <= 1.0, "{context}");
+        // The twin's panel switches as a whole.
+        assert!(number(&file, "timing.scan_out_ms") <= 1.0, "{context}");
+        for band in
+            file["bands"].as_array().unwrap().iter().filter(|band| band["channel"].as_str() == Some("white"))
+        {
+            for change in ["rise", "fall"] {
+                let t10_90 = band[change]["t10_90_ms"].as_float().unwrap();
+                assert!((t10_90 - lcd_ms).abs() < 0.5, "{context}");
+            }
+        }
+        assert!(file["ripple"].get("hz").is_none(), "{context}");
+    }
+    // A scan holds no longer than with the timing that the driver would state, and refuses another projector's.
+    rig = rig.set("sim.projector.latency_refreshes", 2).set("sim.projector.lcd_10_90_ms", 6.0);
+    rig.scan("unknown", &[]).expect(0);
+    rig = rig.set("rig.sync", "sync-2/sync.toml");
+    rig.scan("measured", &[]).expect(0);
+    let hold = |out: &str| rig.report(out)["capture"]["hold_frames"].as_u64().unwrap();
+    assert!(hold("measured") < hold("unknown"), "{} {}", hold("measured"), hold("unknown"));
+    let refused = rig.set("sim.projector.refresh_hz", 50.0).scan("other", &[]).expect(64);
+    assert!(refused.stderr.contains("60.00 Hz") && refused.stderr.contains("rig.sync"), "{}", refused.stderr);
+}
+
+#[test]
+fn ripple_of_the_lamp_is_found() {
+    let flicker: Table = toml::from_str("share = 0.02\nhz = 100.0").unwrap();
+    let rig = Rig::scaled(8.0).set("sim.flicker", flicker);
+    calibrate(&rig, "sync", "sync", &[]).expect(0);
+    let file = table(&rig, "sync/sync.toml");
+    assert!((number(&file, "ripple.hz") - 100.0).abs() < 0.2, "{file}");
+    assert!((number(&file, "ripple.share") / 0.02 - 1.0).abs() < 0.1, "{file}");
+    assert_eq!(file["timing"]["latency_refreshes"].as_integer(), Some(2), "{file}");
+    assert!((number(&file, "timing.settling_ms") - 6.0 / 9f64.ln() * 1000f64.ln()).abs() < 4.0, "{file}");
+}
+
+/// A plate of metal that scatters nothing, and a white card beside it.
+const COUPON: &str = r#"
+[materials.mirror]
+index = [0.96, 6.7]
+roughness = 0.45
+
+[materials.paper]
+diffuse = 0.8
+
+[[objects]]
+name = "coupon"
+material = "mirror"
+level = 0.7
+shape = { plane = { point_mm = [0.0, 0.0, 1000.0], normal = [0.05, 0.02, -1.0] } }
+
+[[objects]]
+name = "card"
+material = "paper"
+level = 0.5
+shape = { plane = { point_mm = [0.0, 0.0, 980.0], normal = [0.05, 0.02, -1.0], x_mm = [60.0, 140.0], y_mm = [-80.0, 80.0] } }
+"#;
+
+/// The rig before [`COUPON`], a fifth of its size.
+fn coupon_rig() -> Rig {
+    let rig = Rig::scaled(5.0).set("sim.scene", "coupon.toml");
+    std::fs::write(rig.path("coupon.toml"), COUPON).unwrap();
+    rig
+}
+
+#[test]
+fn polarization_is_found_from_three_angles_and_guards_scans() {
+    let (error_deg, shift) = (1.7, [[0.31, -0.22], [0.0, 0.0], [0.31, -0.22]]);
+    let extinction = [30.0, 50.0, 70.0];
+    let shifts: Vec<Vec<f64>> = shift.iter().map(|shift| shift.to_vec()).collect();
+    let mut rig = coupon_rig()
+        .set("sim.projector.extinction", extinction.to_vec())
+        .set("sim.projector.panel_shift_px", shifts)
+        .set("rig.extinction_ratio", 0.0)
+        .set("camera.exposure_us", 1600.0);
+    let coupon = ["--coupon", "coupon=20,60,180,120"];
+    for (out, angle) in [("a", 90.0), ("b", 45.0)] {
+        rig = rig.set("sim.analyser.azimuth_error_deg", error_deg + angle);
+        let angle = angle.to_string();
+        calibrate(&rig, "polarization", out, &[&["--angle", angle.as_str()], &coupon[..]].concat()).expect(0);
+        assert!(!rig.path(out).join("polarization.toml").exists());
+    }
+    rig = rig.set("sim.analyser.azimuth_error_deg", error_deg);
+    let (a, b) = (rig.path("a"), rig.path("b"));
+    let rest =
+        ["--with", text(&a), "--with", text(&b), "--card", "card=240,90,40,60", "--watch", "--values", "3"];
+    let run = calibrate(&rig, "polarization", "c", &[&coupon[..], &rest[..]].concat()).expect(0);
+    assert_eq!(run.stderr.matches("H/V").count(), 3, "{}", run.stderr);
+    let file = table(&rig, "c/polarization.toml");
+    assert!((number(&file, "azimuth_error_deg") - error_deg).abs() < 0.2, "{file}");
+    assert_eq!((file["horizontal"].as_str(), file["vertical"].as_str()), (Some("g"), Some("rb")));
+    for (channel, of_panel) in file["channels"].as_array().unwrap().iter().zip(extinction) {
+        // Light along and across the panel's state, each through the polarizer (500:1) along and across its axis.
+        let expected = (of_panel * 500.0 + 1.0) / (of_panel + 500.0);
+        let found = channel["extinction"].as_float().unwrap();
+        assert!((found / expected - 1.0).abs() < 0.05, "{found} {expected}\n{file}");
+    }
+    // The field is flat: its constant is the shift.
+    for (axis, expected) in [("x", 0.31), ("y", -0.22)] {
+        let field = file["misregistration"][axis].as_array().unwrap();
+        let at = |terms: &[f64]| -> f64 {
+            field.iter().zip(terms).map(|(factor, term)| factor.as_float().unwrap() * term).sum()
+        };
+        for terms in [[1.0, 0.0, 0.0, 0.0, 0.0, 0.0], [1.0, 0.3, 0.3, 0.09, 0.09, 0.09]] {
+            assert!((at(&terms) - expected).abs() < 0.05, "{axis}: {file}");
+        }
+    }
+    // Paper returns both states as the sensor likes their colours: 0.8 of green for magenta.
+    assert!((number(&file, "drive.ratio_at_full") / 1.25 - 1.0).abs() < 0.05, "{file}");
+    let green = 255.0 * 0.8f64.powf(1.0 / 2.2);
+    assert!((number(&file, "drive.horizontal") - green).abs() <= 3.0, "{file}");
+    // Scans know the extinction from it, and refuse other channels.
+    rig = rig.set("rig.polarization", "c/polarization.toml").set("camera.exposure_us", 1500.0);
+    rig.scan("scan", &[]).expect(0);
+    let manifest = json(&rig.path("scan/manifest.json"));
+    let known = manifest["processing"]["extinction_ratio"].as_f64();
+    assert_eq!(known, Some(number(&file, "extinction_ratio")), "{manifest}");
+    let swapped = rig.set("projector.horizontal", "rb").set("projector.vertical", "g");
+    let refused = swapped.scan("other", &[]).expect(64);
+    assert!(refused.stderr.contains("rig.polarization"), "{}", refused.stderr);
+}
+
+#[test]
+fn a_polarizer_that_is_far_off_and_surfaces_that_scatter_are_refused() {
+    let mut rig = coupon_rig().set("camera.exposure_us", 1000.0);
+    for (out, angle) in [("a", 90.0), ("b", 45.0)] {
+        rig = rig.set("sim.analyser.azimuth_error_deg", 8.0 + angle);
+        calibrate(&rig, "polarization", out, &["--angle", &angle.to_string()]).expect(0);
+    }
+    rig = rig.set("sim.analyser.azimuth_error_deg", 8.0);
+    let (a, b) = (rig.path("a"), rig.path("b"));
+    let with = ["--with", text(&a), "--with", text(&b)];
+    let run = calibrate(&rig, "polarization", "c", &with).expect(1);
+    assert!(run.stdout.contains("clockwise") && !rig.path("c/polarization.toml").exists(), "{}", run.stdout);
+    let card = ["--coupon", "card=240,90,40,60"];
+    for (out, angle) in [("d", 90.0), ("e", 45.0)] {
+        rig = rig.set("sim.analyser.azimuth_error_deg", angle);
+        calibrate(&rig, "polarization", out, &[&["--angle", &angle.to_string()], &card[..]].concat())
+            .expect(0);
+    }
+    rig = rig.set("sim.analyser.azimuth_error_deg", 0.0);
+    let (d, e) = (rig.path("d"), rig.path("e"));
+    let with = ["--with", text(&d), "--with", text(&e)];
+    let run = calibrate(&rig, "polarization", "f", &[&with[..], &card[..]].concat()).expect(1);
+    assert!(run.stdout.contains("scatters"), "{}", run.stdout);
 }

@@ -7,8 +7,6 @@ use crate::fit::linear;
 
 /// Share of the sweep, at its end, on which the new light is taken as settled.
 const PLATEAU_SHARE: f64 = 0.2;
-/// Share of the sweep, at its beginning, that no display is faster than.
-const BEFORE_SHARE: f64 = 0.04;
 const FEWEST_SAMPLES: usize = 30;
 /// Light counts as light above this share of the change, and above this many sigma.
 const LIGHT_SHARE: f64 = 5e-3;
@@ -55,17 +53,37 @@ struct Progress {
     exposure_ms: f64,
 }
 
-/// Timing of a change from its samples; `exposure_ms` is how long each lasted.
+/// Light at the end of a sweep.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Plateau {
+    /// Its mean.
+    pub light: f64,
+    /// What it varies by beyond the noise of the samples: the lamp.
+    pub lamp: f64,
+}
+
+/// Light at the end of a sweep; dark for no samples.
+pub fn plateau(samples: &[Sample]) -> Plateau {
+    let last = samples.iter().map(|sample| sample.start_ms).fold(0.0, f64::max);
+    let late = || samples.iter().filter(|sample| sample.start_ms >= (1.0 - PLATEAU_SHARE) * last);
+    let count = late().count().max(1) as f64;
+    let light = late().map(|sample| sample.light).sum::<f64>() / count;
+    let scatter =
+        late().map(|sample| (sample.light - light).powi(2) - sample.sigma.powi(2)).sum::<f64>() / count;
+    Plateau { light, lamp: scatter.max(0.0).sqrt() }
+}
+
+/// Timing of a change from its samples; `from` is what was before it, `exposure_ms` how long each sample lasted.
 ///
 /// # Errors
 /// Where the samples do not show a whole change.
-pub fn edge(samples: &[Sample], exposure_ms: f64) -> Result<Edge, SyncError> {
+pub fn edge(samples: &[Sample], from: Plateau, exposure_ms: f64) -> Result<Edge, SyncError> {
     if samples.len() < FEWEST_SAMPLES {
         return Err(SyncError::Samples(samples.len(), FEWEST_SAMPLES));
     }
-    let progress = Progress::new(samples, exposure_ms)?;
-    let first_light_ms = progress.first_light()?;
-    let (settled_ms, settled_sigma_ms) = progress.settled()?;
+    let progress = Progress::new(samples, from, exposure_ms)?;
+    let (settled_ms, settled_sigma_ms, begun_ms) = progress.settled()?;
+    let first_light_ms = progress.first_light(begun_ms)?;
     Ok(Edge {
         first_light_ms,
         t10_90_ms: progress.crossing(0.9) - progress.crossing(0.1),
@@ -75,24 +93,19 @@ pub fn edge(samples: &[Sample], exposure_ms: f64) -> Result<Edge, SyncError> {
 }
 
 impl Progress {
-    fn new(samples: &[Sample], exposure_ms: f64) -> Result<Self, SyncError> {
+    fn new(samples: &[Sample], from: Plateau, exposure_ms: f64) -> Result<Self, SyncError> {
         let mut sorted = samples.to_vec();
         sorted.sort_unstable_by(|a, b| a.start_ms.total_cmp(&b.start_ms));
         let count = sorted.len() as f64;
-        let before = &sorted[..((count * BEFORE_SHARE) as usize).max(1)];
-        let after = &sorted[sorted.len() - (count * PLATEAU_SHARE) as usize..];
-        let mean = |part: &[Sample]| part.iter().map(|sample| sample.light).sum::<f64>() / part.len() as f64;
-        let (from, to) = (mean(before), mean(after));
+        let to = plateau(&sorted);
         let sigma = sorted.iter().map(|sample| sample.sigma).sum::<f64>() / count;
         // What the lamp does belongs to the noise as well.
-        let scatter =
-            after.iter().map(|sample| (sample.light - to).powi(2)).sum::<f64>() / after.len() as f64;
-        let lamp = (scatter - sigma * sigma).max(0.0);
-        let change = to - from;
+        let lamp = to.lamp.max(from.lamp);
+        let change = to.light - from.light;
         let progress = Self {
             time_ms: sorted.iter().map(|sample| sample.start_ms + 0.5 * exposure_ms).collect(),
-            done: sorted.iter().map(|sample| (sample.light - from) / change).collect(),
-            sigma: sorted.iter().map(|sample| (sample.sigma.powi(2) + lamp).sqrt() / change.abs()).collect(),
+            done: sorted.iter().map(|sample| (sample.light - from.light) / change).collect(),
+            sigma: sorted.iter().map(|sample| sample.sigma.hypot(lamp) / change.abs()).collect(),
             exposure_ms,
         };
         // Not `<`: a NaN is no light either.
@@ -108,16 +121,18 @@ impl Progress {
         (0..self.done.len() - 1).find(|&at| lit(at) && lit(at + 1))
     }
 
-    /// Light comes between the ends of the last dark exposure and of the first lit one; the two samples after it say
-    /// where.
-    fn first_light(&self) -> Result<f64, SyncError> {
+    /// Light comes between the ends of the last dark exposure and of the first lit one. Where in between, an exponential
+    /// says, or else the two samples after them.
+    fn first_light(&self, begun_ms: Option<f64>) -> Result<f64, SyncError> {
         let end = |at: usize| self.time_ms[at] + 0.5 * self.exposure_ms;
-        let lit = self.first_lit().filter(|&at| at > 0 && at + 2 < self.done.len());
+        let lit = self.first_lit().filter(|&at| at + 2 < self.done.len());
         let Some(lit) = lit else { return Err(SyncError::Unsettled(end(self.done.len() - 1))) };
+        // No light comes before the flip.
+        let dark = if lit > 0 { end(lit - 1) } else { 0.0 };
         let (a, b) = (lit + 1, lit + 2);
         let slope = (self.done[b] - self.done[a]) / (self.time_ms[b] - self.time_ms[a]);
-        let back = if slope > 0.0 { self.time_ms[a] - self.done[a] / slope } else { end(lit - 1) };
-        Ok(back.clamp(end(lit - 1), end(lit)))
+        let back = if slope > 0.0 { self.time_ms[a] - self.done[a] / slope } else { dark };
+        Ok(begun_ms.unwrap_or(back).clamp(dark, end(lit).max(dark)))
     }
 
     /// When `share` of the change is done.
@@ -129,8 +144,8 @@ impl Progress {
     }
 
     /// When [`SETTLED`] is left: an exponential tail extrapolates below the noise of single samples; where the samples
-    /// contradict it they are believed.
-    fn settled(&self) -> Result<(f64, f64), SyncError> {
+    /// contradict it they are believed. Returns its sigma too, and where the exponential begins, if it is one.
+    fn settled(&self) -> Result<(f64, f64, Option<f64>), SyncError> {
         let last = self.done.len() - 1;
         let begin = (0..=last).rev().find(|&at| 1.0 - self.done[at] > TAIL_SHARE).map_or(0, |at| at + 1);
         let tail = begin..last + 1;
@@ -150,9 +165,11 @@ impl Progress {
             Some(at) => self.time_ms[at] + 0.5 * self.exposure_ms,
             None => self.time_ms[begin] - 0.5 * self.exposure_ms,
         };
-        let fit_ms = fitted.map_or((seen_ms, step), |tail| (tail.settled_ms, tail.sigma_ms));
         // A curve that contradicts the tail by more than a step is no exponential.
-        Ok(if seen_ms > fit_ms.0 + 2.0 * step { (seen_ms, step) } else { fit_ms })
+        Ok(match fitted.filter(|tail| seen_ms <= tail.settled_ms + 2.0 * step) {
+            Some(tail) => (tail.settled_ms, tail.sigma_ms, Some(tail.begun_ms)),
+            None => (seen_ms, step, None),
+        })
     }
 
     /// What is left, as `amplitude exp(-(t - t0) / tau) + rest`; `None` where the change is over within a few samples.
@@ -191,7 +208,8 @@ impl Progress {
         if fit.reduced_chi2 > WORST_TAIL_CHI2 {
             return None;
         }
-        Some(Tail { settled_ms, sigma_ms, rest: fit.parameters[1] })
+        let begun_ms = begin_ms + tau * fit.parameters[0].ln();
+        Some(Tail { settled_ms, sigma_ms, begun_ms, rest: fit.parameters[1] })
     }
 }
 
@@ -200,6 +218,8 @@ impl Progress {
 struct Tail {
     settled_ms: f64,
     sigma_ms: f64,
+    /// Where the whole change would be left.
+    begun_ms: f64,
     /// What was taken as settled is this share off.
     rest: f64,
 }
@@ -210,6 +230,10 @@ mod tests {
     use rand::{RngExt, SeedableRng, rngs::StdRng};
 
     const EXPOSURE_MS: f64 = 1.0;
+
+    fn dark(light: f64) -> Plateau {
+        Plateau { light, lamp: 0.0 }
+    }
 
     /// Mean over exposures of a change that begins at `first` and goes as `done(ms since then)`; integrated in small
     /// steps.
@@ -238,11 +262,13 @@ mod tests {
     #[test]
     fn exponential_changes_are_found() {
         for (number, (t10_90, first)) in
-            [(6.0, 33.333), (2.0, 16.667), (12.0, 50.0), (20.0, 33.333), (6.0, 20.4)].into_iter().enumerate()
+            [(6.0, 33.333), (2.0, 16.667), (12.0, 50.0), (20.0, 33.333), (6.0, 20.4), (6.0, 0.0)]
+                .into_iter()
+                .enumerate()
         {
             let tau = t10_90 / 9f64.ln();
             let samples = sweep(first, 1e-4, number as u64, |ms| 1.0 - (-ms / tau).exp());
-            let found = edge(&samples, EXPOSURE_MS).unwrap();
+            let found = edge(&samples, dark(50.0), EXPOSURE_MS).unwrap();
             let settled = first + tau * 1000f64.ln();
             let context = format!("{t10_90} ms from {first} ms: {found:?}, settled {settled}");
             assert!((found.first_light_ms - first).abs() <= 1.0, "{context}");
@@ -257,7 +283,10 @@ mod tests {
         let samples = sweep(33.0, 1e-4, 3, |ms| 1.0 - (-ms / 2.7).exp());
         let upside_down: Vec<Sample> =
             samples.iter().map(|sample| Sample { light: 1000.0 - sample.light, ..*sample }).collect();
-        let (a, b) = (edge(&samples, EXPOSURE_MS).unwrap(), edge(&upside_down, EXPOSURE_MS).unwrap());
+        let (a, b) = (
+            edge(&samples, dark(50.0), EXPOSURE_MS).unwrap(),
+            edge(&upside_down, dark(950.0), EXPOSURE_MS).unwrap(),
+        );
         assert!((a.settled_ms - b.settled_ms).abs() < 1e-6 && (a.t10_90_ms - b.t10_90_ms).abs() < 1e-6);
     }
 
@@ -265,19 +294,19 @@ mod tests {
     fn a_change_that_is_no_exponential_is_believed_as_seen() {
         // Two thirds at once; the rest creeps linearly for 40 ms.
         let samples = sweep(20.0, 5e-5, 1, |ms| (0.7 + 0.3 * ms / 40.0).min(1.0));
-        let found = edge(&samples, EXPOSURE_MS).unwrap();
+        let found = edge(&samples, dark(50.0), EXPOSURE_MS).unwrap();
         assert!((59.0..62.0).contains(&found.settled_ms), "{found:?}");
         // And a display without any lag.
-        let found = edge(&sweep(20.0, 5e-5, 1, |_| 1.0), EXPOSURE_MS).unwrap();
+        let found = edge(&sweep(20.0, 5e-5, 1, |_| 1.0), dark(50.0), EXPOSURE_MS).unwrap();
         assert!((found.settled_ms - 20.0).abs() <= 1.0 && found.t10_90_ms <= 1.01, "{found:?}");
     }
 
     #[test]
     fn what_is_no_change_is_refused() {
         let flat = sweep(20.0, 1e-3, 1, |_| 0.0);
-        assert!(matches!(edge(&flat, EXPOSURE_MS), Err(SyncError::NoLight { .. })));
+        assert!(matches!(edge(&flat, dark(50.0), EXPOSURE_MS), Err(SyncError::NoLight { .. })));
         let slow = sweep(20.0, 1e-4, 1, |ms| 1.0 - (-ms / 90.0).exp());
-        assert!(matches!(edge(&slow, EXPOSURE_MS), Err(SyncError::Unsettled(_))));
-        assert!(matches!(edge(&flat[..5], EXPOSURE_MS), Err(SyncError::Samples(5, _))));
+        assert!(matches!(edge(&slow, dark(50.0), EXPOSURE_MS), Err(SyncError::Unsettled(_))));
+        assert!(matches!(edge(&flat[..5], dark(50.0), EXPOSURE_MS), Err(SyncError::Samples(5, _))));
     }
 }

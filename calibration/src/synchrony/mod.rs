@@ -9,11 +9,14 @@ mod ripple;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-pub use edge::{Edge, Sample, edge};
+pub use edge::{Edge, Plateau, Sample, edge, plateau};
 pub use ripple::{Reading, Ripple, ripple};
 
 /// What is left of a change when it counts as settled, as a share of the change.
 pub const SETTLED: f64 = 1e-3;
+
+/// Settling times with a larger sigma are not taken at their value.
+const CERTAIN_MS: f64 = 0.5;
 
 /// Why samples show no timing.
 #[derive(Debug, Clone, PartialEq, Error)]
@@ -71,7 +74,13 @@ pub struct Timing {
 pub fn combine(bands: &[BandTiming], period_ms: f64) -> Option<Timing> {
     let edges = || bands.iter().flat_map(|band| [&band.rise, &band.fall]);
     let latency_ms = edges().map(|edge| edge.first_light_ms).reduce(f64::min)?;
-    let settled_ms = edges().map(|edge| edge.settled_ms).reduce(f64::max)?;
+    // The largest of many uncertain values is mostly uncertain: a channel that the camera hardly sees counts for what it
+    // proves.
+    let proven = |edge: &Edge| match edge.settled_sigma_ms <= CERTAIN_MS {
+        true => edge.settled_ms,
+        false => edge.settled_ms - 3.0 * edge.settled_sigma_ms,
+    };
+    let settled_ms = edges().map(proven).reduce(f64::max)?;
     // Noise moves the first light of one channel or another: bands are compared within each.
     let spread = |channel: &str| {
         let firsts =
@@ -90,6 +99,27 @@ pub fn combine(bands: &[BandTiming], period_ms: f64) -> Option<Timing> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn an_uncertain_channel_counts_for_what_it_proves() {
+        let edge = |settled_ms, settled_sigma_ms| Edge {
+            first_light_ms: 33.0,
+            settled_ms,
+            settled_sigma_ms,
+            t10_90_ms: 6.0,
+        };
+        let band = |rise| BandTiming {
+            channel: "blue".into(),
+            first_row: 0,
+            end_row: 9,
+            rise,
+            fall: edge(52.0, 0.1),
+        };
+        let settling = |rise| combine(&[band(rise)], 16.7).unwrap().settling_ms;
+        assert_eq!(settling(edge(54.0, 1.0)), 19.0);
+        assert_eq!(settling(edge(64.0, 1.0)), 28.0);
+        assert_eq!(settling(edge(54.0, 0.2)), 21.0);
+    }
 
     #[test]
     fn the_earliest_and_the_latest_band_decide() {

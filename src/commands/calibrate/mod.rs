@@ -2,6 +2,8 @@
 
 mod noise;
 mod output;
+mod polarization;
+mod sync;
 
 use clap::Subcommand;
 
@@ -14,7 +16,11 @@ use crate::{
 #[derive(Debug, Subcommand)]
 pub enum Calibrate {
     /// Gain, read noise, black level, linearity and saturation of the camera, by photon transfer.
-    Noise(noise::Args),
+    Noise(output::Place),
+    /// Extinction and channels, azimuth of the polarizer, misregistration and drive levels, on bare metal.
+    Polarization(polarization::Args),
+    /// Latency, rise and fall of the projector, and ripple of its lamp, from flashes.
+    Sync(output::Place),
 }
 
 /// Runs a calibration; `load` reads the settings from the configuration file that its arguments name.
@@ -25,5 +31,7 @@ pub fn calibrate(
 ) -> Result<u8, Failure> {
     match what {
         Calibrate::Noise(args) => noise::run(args, &load(args.config.as_deref())?, json),
+        Calibrate::Polarization(args) => polarization::run(args, &load(args.config())?, json),
+        Calibrate::Sync(args) => sync::run(args, &load(args.config.as_deref())?, json),
     }
 }

@@ -1,47 +1,28 @@
 //! `polscan calibrate noise`.
 
-use std::{path::PathBuf, time::SystemTime};
+use std::time::SystemTime;
 
 use serde_json::{Value, json};
 
-use super::output::{Output, Summary, series};
+use super::output::{Output, Place, Summary, series, with_rig};
 use crate::{
-    app::Rig,
-    commands::{progress::Bar, scan::cancel_on_interrupt},
     compare::plot::Plot,
     config::Settings,
-    engine::{Failure, rig_failure},
+    engine::Failure,
     measure::{
         files::{DeviceKey, Document, NoiseFigures, NoiseFile, NoiseSettings},
         noise::{Measured, measure},
     },
-    sequencer::CancelFlag,
     store::time::rfc3339_utc,
 };
 
 /// Ill pixels that a report lists of each kind.
 const MOST_LISTED: usize = 200;
 
-/// Arguments of `polscan calibrate noise`.
-#[derive(Debug, clap::Args)]
-pub struct Args {
-    /// Configuration file; what it leaves out is as in config/default.toml.
-    #[arg(long, value_name = "FILE")]
-    pub config: Option<PathBuf>,
-    /// Folder for the result; must be absent or empty.
-    #[arg(long, value_name = "DIR")]
-    out: PathBuf,
-}
-
 /// Measures and writes; returns the exit code.
-pub fn run(args: &Args, settings: &Settings, json: bool) -> Result<u8, Failure> {
-    let mut output = Output::create(&args.out)?;
-    let mut rig = Rig::open(settings).map_err(rig_failure)?;
-    let cancel = CancelFlag::default();
-    cancel_on_interrupt(&cancel);
-    let bar = Bar::new(1);
-    let measured = measure(&mut rig, settings, &cancel, &mut |what| bar.say(what.to_owned()))?;
-    drop(bar);
+pub fn run(place: &Place, settings: &Settings, json: bool) -> Result<u8, Failure> {
+    let mut output = Output::create(&place.out)?;
+    let measured = with_rig(settings, |rig, cancel, progress| measure(rig, settings, cancel, progress))?;
     let linearity = &measured.noise.linearity;
     let refused = (!linearity.linear).then(|| {
         format!(
@@ -56,7 +37,7 @@ pub fn run(args: &Args, settings: &Settings, json: bool) -> Result<u8, Failure> 
     for (name, plot) in plots(&measured) {
         output.plot(name, &plot)?;
     }
-    output.finish(&args.out, &report(&measured, &file), &Summary { lines: lines(&measured), refused }, json)
+    output.finish(&place.out, &report(&measured, &file), &Summary { lines: lines(&measured), refused }, json)
 }
 
 fn file(measured: &Measured) -> NoiseFile {

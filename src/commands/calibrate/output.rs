@@ -1,16 +1,42 @@
 //! Where a calibration goes: a folder with a file for scans, a report and plots, and a few lines for a person.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use serde_json::Value;
 
 use crate::{
-    commands::{failure::FAILED, say},
+    app::Rig,
+    commands::{failure::FAILED, progress::Bar, say, scan::cancel_on_interrupt},
     compare::plot::{Plot, Series},
-    engine::Failure,
+    config::Settings,
+    engine::{Failure, rig_failure},
     measure::files::Document,
+    sequencer::CancelFlag,
     store::{BundleWriter, StorageError},
 };
+
+/// Arguments of a calibration: what rig, and where the result goes.
+#[derive(Debug, clap::Args)]
+pub struct Place {
+    /// Configuration file; what it leaves out is as in config/default.toml.
+    #[arg(long, value_name = "FILE")]
+    pub config: Option<PathBuf>,
+    /// Folder for the result; must be absent or empty.
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+}
+
+/// Opens the rig for a measurement that an interrupt ends, and says what is being done on a terminal.
+pub fn with_rig<T>(
+    settings: &Settings,
+    measure: impl FnOnce(&mut Rig, &CancelFlag, &mut dyn FnMut(&str)) -> Result<T, Failure>,
+) -> Result<T, Failure> {
+    let mut rig = Rig::open(settings).map_err(rig_failure)?;
+    let cancel = CancelFlag::default();
+    cancel_on_interrupt(&cancel);
+    let bar = Bar::new(1);
+    measure(&mut rig, &cancel, &mut |what| bar.say(what.to_owned()))
+}
 
 /// The folder that a calibration is written to.
 pub struct Output {
