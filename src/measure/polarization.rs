@@ -132,7 +132,8 @@ pub fn measure(
     Ok(Measured { camera, projector, set, field, drive })
 }
 
-/// Watches V and H while somebody turns the polarizer: `seen` gets both above no light, in DN, until it says stop.
+/// Watches V and H while somebody turns the polarizer: `seen` gets both above no light, in DN, until it says stop or
+/// `cancel` does.
 ///
 /// # Errors
 /// As [`measure`].
@@ -146,9 +147,14 @@ pub fn watch(
     let mut bench = Bench::new(rig, OPERATION, cancel);
     let mut stage = Stage::set_up(&mut bench, settings, coupon, None)?;
     loop {
-        let (h, v) = (stage.light(5)?.0, stage.light(6)?.0);
-        if !seen(h, v) {
-            return Ok(());
+        match (stage.light(5), stage.light(6)) {
+            (Ok((h, _)), Ok((v, _))) => {
+                if !seen(h, v) {
+                    return Ok(());
+                }
+            }
+            _ if cancel.is_cancelled() => return Ok(()),
+            (Err(failure), _) | (_, Err(failure)) => return Err(failure),
         }
     }
 }

@@ -19,7 +19,7 @@ fn table(rig: &Rig, name: &str) -> Table {
     let path = rig.path(name);
     let content =
         std::fs::read_to_string(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
-    content.parse().unwrap()
+    content.parse().expect("a calibration is TOML")
 }
 
 /// Runs `polscan calibrate WHAT` into the folder `out`.
@@ -156,7 +156,7 @@ shape = { plane = { point_mm = [0.0, 0.0, 980.0], normal = [0.05, 0.02, -1.0], x
 /// The rig before [`COUPON`], a fifth of its size.
 fn coupon_rig() -> Rig {
     let rig = Rig::scaled(5.0).set("sim.scene", "coupon.toml");
-    std::fs::write(rig.path("coupon.toml"), COUPON).unwrap();
+    std::fs::write(rig.path("coupon.toml"), COUPON).expect("the scene is written");
     rig
 }
 
@@ -240,4 +240,73 @@ fn a_polarizer_that_is_far_off_and_surfaces_that_scatter_are_refused() {
     let with = ["--with", text(&d), "--with", text(&e)];
     let run = calibrate(&rig, "polarization", "f", &[&with[..], &card[..]].concat()).expect(1);
     assert!(run.stdout.contains("scatters"), "{}", run.stdout);
+}
+
+#[test]
+fn the_planner_forecasts_what_scans_of_the_twin_reach() {
+    let rig = Rig::small();
+    rig.scan("scan", &[]).expect(0);
+    let (_, modulation) = rig.map("scan", "maps.npz", "modulation");
+    let (_, depth_mm) = rig.map("scan", "truth.npz", "depth");
+    let report = rig.report("scan");
+    let gain = json(&rig.path("scan/manifest.json"))["camera"]["gain_dn_per_electron"].as_f64().unwrap();
+    for plane in report["planes"].as_array().unwrap() {
+        let black = plane["name"] == "black";
+        // What the planner cannot know is how bright the surfaces are: that is taken from the scan. Noise is largest where
+        // they are darkest, hence the quadratic mean of 1 / modulation.
+        let squares: Vec<f64> = modulation
+            .iter()
+            .zip(&depth_mm)
+            .filter(|(modulation, depth_mm)| (**depth_mm < 985.0) == black && **modulation > 0.0)
+            .map(|(modulation, _)| (f64::from(*modulation) / gain).powi(-2))
+            .collect();
+        let modulation_e = (squares.iter().sum::<f64>() / squares.len() as f64).powf(-0.5);
+        let share = modulation_e / (1.0 - 1.0 / 16.2) / 10_500.0;
+        // The small rig has lenses of a quarter of the focal length on a quarter of the pixels.
+        let run = polscan(&[
+            "plan",
+            "--json",
+            "--focal-mm",
+            "4.0003",
+            "--sensor",
+            "400x300",
+            "--projector",
+            "256x192",
+            "--bright",
+            &share.to_string(),
+            "--extinction-ratio",
+            "16.2",
+        ])
+        .expect(0);
+        let forecast: serde_json::Value = serde_json::from_str(&run.stdout).unwrap();
+        let expected = forecast["forecast"]["bright"]["column_rms_px"].as_f64().unwrap();
+        let found = plane["truth"]["column_rms_px"].as_f64().unwrap();
+        let depth = forecast["forecast"]["bright"]["sigma_z_mm"].as_f64().unwrap();
+        let found_depth = plane["truth"]["depth_rmse_mm"].as_f64().unwrap();
+        // Where noise reaches the height of the fringe, crossings are no longer linear in it, and the forecast is kind.
+        let most = if black { 2.0 } else { 1.3 };
+        let context = format!("{}: {found} {expected} px, {found_depth} {depth} mm", plane["name"]);
+        assert!((0.7..most).contains(&(found / expected)), "{context}");
+        assert!((0.7..most).contains(&(found_depth / depth)), "{context}");
+    }
+}
+
+#[test]
+fn the_planner_reads_its_own_designs_and_names_what_is_wrong() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("design.toml");
+    std::fs::write(&path, "baseline_mm = 104.8\nmode = \"fast\"").unwrap();
+    let run = polscan(&["plan", "--from", text(&path), "--json", "--distance-mm", "900"]).expect(0);
+    let answer: serde_json::Value = serde_json::from_str(&run.stdout).unwrap();
+    assert_eq!(answer["design"]["baseline_mm"].as_f64(), Some(104.8));
+    assert_eq!(
+        (answer["design"]["distance_mm"].as_f64(), answer["forecast"]["frames"].as_u64()),
+        (Some(900.0), Some(24))
+    );
+    let plain = polscan(&["plan", "--focal-mm", "6"]).expect(0);
+    assert!(plain.stdout.contains("sigma_z") && plain.stdout.contains("finest stripes"), "{}", plain.stdout);
+    let refused = polscan(&["plan", "--baseline-mm", "0"]).expect(65);
+    assert!(refused.stderr.contains("baseline_mm"), "{}", refused.stderr);
+    std::fs::write(&path, "baseline = 1").unwrap();
+    polscan(&["plan", "--from", text(&path)]).expect(65);
 }

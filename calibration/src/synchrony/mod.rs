@@ -76,7 +76,10 @@ pub fn combine(bands: &[BandTiming], period_ms: f64) -> Option<Timing> {
     let latency_ms = edges().map(|edge| edge.first_light_ms).reduce(f64::min)?;
     // The largest of many uncertain values is mostly uncertain: a channel that the camera hardly sees counts for what it
     // proves.
-    let proven = |edge: &Edge| match edge.settled_sigma_ms <= CERTAIN_MS {
+    let best_ms = edges().map(|edge| edge.settled_sigma_ms).reduce(f64::min)?;
+    // A lamp that ripples makes all of them uncertain: then they count as they are.
+    let certain_ms = CERTAIN_MS.max(2.0 * best_ms);
+    let proven = |edge: &Edge| match edge.settled_sigma_ms <= certain_ms {
         true => edge.settled_ms,
         false => edge.settled_ms - 3.0 * edge.settled_sigma_ms,
     };
@@ -119,6 +122,8 @@ mod tests {
         assert_eq!(settling(edge(54.0, 1.0)), 19.0);
         assert_eq!(settling(edge(64.0, 1.0)), 28.0);
         assert_eq!(settling(edge(54.0, 0.2)), 21.0);
+        let all = BandTiming { fall: edge(52.0, 1.0), ..band(edge(54.0, 1.5)) };
+        assert_eq!(combine(&[all], 16.7).unwrap().settling_ms, 21.0);
     }
 
     #[test]

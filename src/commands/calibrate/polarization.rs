@@ -20,6 +20,7 @@ use crate::{
         polarization::{Measured, Set, Task, measure, watch},
     },
     report::NamedRegion,
+    sequencer::CancelFlag,
     store::{Policy, source::read_bounded, time::rfc3339_utc},
 };
 
@@ -74,10 +75,12 @@ pub fn run(args: &Args, settings: &Settings, json: bool) -> Result<u8, Failure> 
         edges: args.angle.abs() <= EDGES_WITHIN_DEG,
     };
     let measured = with_rig(settings, |rig, cancel, progress| {
-        if args.watch {
-            follow(args.values, |seen| watch(rig, settings, task.coupon, cancel, seen))?;
+        if !args.watch {
+            return measure(rig, settings, &task, cancel, progress);
         }
-        measure(rig, settings, &task, cancel, progress)
+        follow(args.values, |seen| watch(rig, settings, task.coupon, cancel, seen))?;
+        // The interrupt ended the watch; a second one ends the program.
+        measure(rig, settings, &task, &CancelFlag::default(), progress)
     })?;
     let sets: Vec<&Set> = earlier.iter().chain([&measured.set]).collect();
     let turns: Vec<Turn> = sets.iter().map(|set| set.turn).collect();
