@@ -39,6 +39,8 @@ enum Command {
     /// Measure what the rig is like, for scans to use.
     #[command(subcommand)]
     Calibrate(commands::Calibrate),
+    /// Forecast what a rig will do from its data sheets.
+    Plan(commands::PlanArgs),
     /// Write the pattern images as PNG, with the manifest that describes them.
     Patterns(Patterns),
     /// Run as a service with a REST interface.
@@ -292,6 +294,7 @@ fn dispatch(cli: &Cli) -> Result<u8, Failure> {
             };
             commands::calibrate(what, load, cli.json)
         }
+        Command::Plan(args) => commands::plan(args, cli.json),
         Command::Patterns(args) => {
             let settings = layers(&args.config, Vec::new()).load()?;
             commands::patterns(&settings, args.mode, args.size, &args.out, cli.json)

@@ -9,6 +9,7 @@ pub mod compare;
 pub mod config;
 pub mod engine;
 mod evidence;
+pub mod measure;
 pub mod pipeline;
 pub mod report;
 pub mod scanner;

@@ -4,6 +4,7 @@
 //! pictures, takes frames and writes files is the program's.
 
 pub mod boards;
+pub mod fit;
 pub mod noise;
 pub mod observation;
 pub mod planner;

@@ -9,6 +9,7 @@ mod devices;
 mod failure;
 mod notify;
 mod patterns;
+mod plan;
 mod progress;
 mod scan;
 mod serve;
@@ -25,6 +26,7 @@ pub use decode::decode;
 pub use devices::devices;
 pub use failure::{USAGE, exit_code, print_failure, print_usage};
 pub use patterns::{Size, patterns};
+pub use plan::{PlanArgs, plan};
 pub use scan::scan;
 pub use serve::serve;
 

@@ -12,7 +12,7 @@ use crate::{
 
 /// A projector size on the command line.
 #[derive(Debug, Clone, Copy)]
-pub struct Size(ProjectorSize);
+pub struct Size(pub(super) ProjectorSize);
 
 impl FromStr for Size {
     type Err = String;

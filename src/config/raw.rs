@@ -97,6 +97,12 @@ pub struct Rig {
     pub calibration_unit_mm: f64,
     /// H over V that the rig shows on metal; 0 is unknown.
     pub extinction_ratio: f64,
+    /// File of the camera's measured noise, relative to the configuration file; empty for none.
+    pub noise: String,
+    /// File of the projector's measured timing, likewise.
+    pub sync: String,
+    /// File of the measured polarization, likewise.
+    pub polarization: String,
 }
 
 /// `[volume]`

@@ -15,7 +15,10 @@ use super::{
     layers::read_text,
     raw::{self, DeviceDriver, Raw},
 };
-use crate::decode::Thresholds;
+use crate::{
+    decode::Thresholds,
+    measure::files::{self, Document, RigFiles},
+};
 
 /// Where the calibration of the rig comes from.
 #[derive(Debug, Clone, PartialEq)]
@@ -53,12 +56,15 @@ pub struct Settings {
     pub tokens: Option<PathBuf>,
     /// Files of certificate and key, resolved against the folder of the configuration.
     pub tls: Option<(PathBuf, PathBuf)>,
+    /// What was measured of the rig.
+    pub measured: RigFiles,
 }
 
 impl Settings {
     /// H over V that the rig shows on metal, where it is known.
     pub fn extinction_ratio(&self) -> Option<f64> {
-        Some(self.raw.rig.extinction_ratio).filter(|&ratio| ratio > 0.0)
+        let configured = Some(self.raw.rig.extinction_ratio).filter(|&ratio| ratio > 0.0);
+        configured.or_else(|| Some(self.measured.polarization.as_ref()?.extinction_ratio))
     }
 }
 
@@ -77,6 +83,11 @@ impl Settings {
         let tokens = (!raw.api.tokens.is_empty()).then(|| folder.join(&raw.api.tokens));
         let listen = listen(&raw.api, tokens.is_some(), faults);
         let tls = tls(&raw.api, folder, faults);
+        let measured = RigFiles {
+            noise: measured(&raw.rig.noise, folder, faults),
+            sync: measured(&raw.rig.sync, folder, faults),
+            polarization: measured(&raw.rig.polarization, folder, faults),
+        };
         if !faults.is_empty() {
             return None;
         }
@@ -103,6 +114,7 @@ impl Settings {
             listen: listen?,
             tokens,
             tls,
+            measured,
             raw,
         })
     }
@@ -251,6 +263,14 @@ fn calibration(rig: &raw::Rig, folder: &Path, faults: &mut Faults) -> Option<Rig
         path,
         projector_left: rig.calibration_projector_left,
         unit_mm: rig.calibration_unit_mm,
+    })
+}
+
+/// A file of what was measured.
+fn measured<T: Document>(name: &str, folder: &Path, faults: &mut Faults) -> Option<T> {
+    files::load(name, folder, read_text).unwrap_or_else(|fault| {
+        faults.push((T::KEY.into(), fault));
+        None
     })
 }
 

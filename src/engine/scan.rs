@@ -127,6 +127,20 @@ impl Scan {
         let device = |source| Failure::Device { operation: "apply the camera settings", source };
         let applied = rig.camera.apply(&settings.camera).map_err(device)?;
         let (camera, projector) = (rig.camera.info().clone(), rig.projector.info().clone());
+        let applied = settings
+            .measured
+            .camera(&camera, applied)
+            .map_err(|stale| setup("use the measured noise", stale))?;
+        let projector = settings
+            .measured
+            .projector(projector)
+            .map_err(|stale| setup("use the measured timing", stale))?;
+        if let Some(polarization) = &settings.measured.polarization {
+            let channels = [settings.raw.projector.horizontal.as_str(), &settings.raw.projector.vertical];
+            polarization
+                .check(&camera, &projector, channels)
+                .map_err(|stale| setup("use the measured polarization", stale))?;
+        }
         let size = ProjectorSize { width: projector.width, height: projector.height };
         let sequence =
             Sequence::new(settings.mode, size).map_err(|e| Failure::data("make the patterns", e))?;

@@ -1,6 +1,7 @@
 //! The program from outside: commands in, folders and exit codes out, on a small copy of the paper's rig.
 
 mod bad_input;
+mod calibrate;
 mod captures_of_the_twin;
 #[path = "../faults/cases.rs"]
 #[allow(dead_code, reason = "the suite of faults needs more of it")]
