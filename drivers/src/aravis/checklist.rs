@@ -279,9 +279,14 @@ impl Checklist<'_> {
         let [width_read, height_read, x, y] = read;
         let got = Region { x, y, width: width_read, height: height_read };
         let empty = region.width == 0 || region.height == 0;
-        if got != region || empty {
+        // Not every camera refuses what is not a multiple of its steps.
+        let uneven = sides.into_iter().find_map(|(feature, value)| {
+            let step = self.features.increment(feature)?;
+            (f64::from(value) % step != 0.0).then(|| format!("{feature} in steps of {step}"))
+        });
+        if got != region || empty || uneven.is_some() {
             let text = |r: Region| format!("{} x {} at ({}, {})", r.width, r.height, r.x, r.y);
-            let why = refused.map(|why| format!(": {why}")).unwrap_or_default();
+            let why = uneven.or(refused).map(|why| format!(": {why}")).unwrap_or_default();
             self.differs("region", text(region), format!("{} of {width} x {height}{why}", text(got)));
         }
         Ok((!empty).then_some(got))
