@@ -499,15 +499,15 @@ fn a_camera_is_listed_with_what_keeps_it_from_being_used() {
         mine[0].unusable.clone()
     };
     assert_eq!(unusable(), None);
-    let camera = cameras.open(Some("PS-17")).unwrap();
+    let camera = cameras.open(Some(ADDRESS)).unwrap();
     assert_eq!(unusable(), None, "it is this process that uses it");
-    let again = cameras.open(Some("PS-17")).err().unwrap();
+    let again = cameras.open(Some(ADDRESS)).err().unwrap();
     assert!(again.to_string().contains("is open already"), "{again}");
     drop(camera);
     // Another program, as far as the camera can tell.
     let other = aravis::Camera::new(Some(ADDRESS)).unwrap();
     assert!(unusable().is_some_and(|why| why.contains("another program")));
-    let busy = cameras.open(Some("PS-17")).err().unwrap();
+    let busy = cameras.open(Some(ADDRESS)).err().unwrap();
     assert!(busy.to_string().contains("another program"), "{busy}");
     drop(other);
     let missing = cameras.open(Some("PS-18")).err().unwrap();

@@ -11,7 +11,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use polscan_drivers::{camera::CameraInfo, error::DeviceError, projector::ProjectorInfo};
+use polscan_drivers::{camera::CameraInfo, projector::ProjectorInfo};
 use polscan_patterns::{Mode, Picture, ProjectorSize, Role, Sequence};
 use tokio::sync::oneshot;
 
@@ -327,9 +327,8 @@ impl Open {
             }
             Ok(Err(failure)) => {
                 // A device that refuses a setting is well.
-                let refused = |source: &DeviceError| matches!(source, DeviceError::Refused { .. });
                 let broken = match &failure {
-                    Failure::Device { source, .. } if !refused(source) => Some(failure.chain()),
+                    Failure::Device { source, .. } if !source.is_refusal() => Some(failure.chain()),
                     _ => None,
                 };
                 (News::Refused { id, failure }, broken)

@@ -3,7 +3,7 @@
 
 use std::{
     sync::{
-        Arc,
+        Arc, OnceLock,
         mpsc::{Receiver, RecvTimeoutError, Sender, TryRecvError, channel},
     },
     time::Duration,
@@ -60,8 +60,8 @@ pub struct Actor {
     health: Health,
     applied: Option<Applied>,
     lost: Receiver<()>,
-    /// Why the camera is gone.
-    gone: Option<DeviceError>,
+    /// Why the camera is gone, for everybody who asks.
+    gone: Arc<OnceLock<DeviceError>>,
 }
 
 impl Actor {
@@ -72,6 +72,7 @@ impl Actor {
         options: Options,
         clock: Arc<dyn Clock>,
         health: Health,
+        gone: Arc<OnceLock<DeviceError>>,
     ) -> Result<(Self, CameraInfo), DeviceError> {
         let unavailable = |detail: String| DeviceError::Unavailable { device: device.to_owned(), detail };
         let camera = library::open(id).map_err(|error| {
@@ -105,7 +106,7 @@ impl Actor {
             health,
             applied: None,
             lost,
-            gone: None,
+            gone,
         };
         Ok((actor, info))
     }
@@ -133,6 +134,10 @@ impl Actor {
                 Some(command) => self.handle(command),
                 None => self.poll(POLL),
             }
+            // After the answer: whoever waits for it shall not wait for this.
+            if self.gone.get().is_some() {
+                self.close();
+            }
         }
         self.close();
     }
@@ -152,7 +157,7 @@ impl Actor {
 
     /// The features of a camera that is there.
     fn features(&self) -> Result<&Features, DeviceError> {
-        self.features.as_ref().ok_or_else(|| match &self.gone {
+        self.features.as_ref().ok_or_else(|| match self.gone.get() {
             Some(error) => error.clone(),
             None => DeviceError::Unavailable {
                 device: self.device.clone(),
@@ -276,7 +281,7 @@ impl Actor {
         }
     }
 
-    /// Lets go of a camera that does not answer; the error that says so from now on.
+    /// Gives up a camera that does not answer; the error that says so from now on.
     fn lose(&mut self, what: &str) -> DeviceError {
         let detail = format!("{what}; check power and cable, it is opened again by itself");
         let error = DeviceError::Unavailable { device: self.device.clone(), detail };
@@ -285,15 +290,12 @@ impl Actor {
     }
 
     fn lose_with(&mut self, error: DeviceError) {
-        if self.gone.is_some() {
-            return;
+        if self.gone.set(error.clone()).is_ok() {
+            self.health.enter(&self.device, Event::Lost);
+            if let Some(running) = &self.running {
+                running.fail(&error);
+            }
         }
-        self.health.enter(&self.device, Event::Lost);
-        if let Some(running) = &self.running {
-            running.fail(&error);
-        }
-        self.gone = Some(error);
-        self.close();
     }
 
     /// Stops and closes in the order that leaves a camera usable. Each step blocks for seconds on one that is gone, and

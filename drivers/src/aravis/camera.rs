@@ -2,11 +2,11 @@
 
 use std::{
     sync::{
-        Arc,
+        Arc, OnceLock,
         mpsc::{Receiver, RecvTimeoutError, Sender, channel},
     },
     thread,
-    time::Duration,
+    time::{Duration, Instant},
 };
 
 use super::{
@@ -23,6 +23,9 @@ use crate::{
 
 /// Longest that the camera's thread may take for a command: a camera that is gone blocks each access for seconds.
 const ANSWER: Duration = Duration::from_secs(30);
+
+/// How long an answer is waited for between two looks at whether the camera is gone.
+const LOOK: Duration = Duration::from_millis(50);
 
 /// Longest that closing is waited for; the thread then ends by itself.
 const CLOSING: Duration = Duration::from_secs(15);
@@ -41,8 +44,10 @@ pub fn open(
     let (alive, closed) = channel::<()>();
     let (id, device) = (id.to_owned(), name.to_owned());
     let thread_clock = clock.clone();
+    let gone = Arc::new(OnceLock::new());
+    let gone_there = gone.clone();
     let work = move || {
-        match Actor::open(&id, &device, options, thread_clock, health) {
+        match Actor::open(&id, &device, options, thread_clock, health, gone_there) {
             Ok((actor, info)) => {
                 // Whoever does not wait any more has dropped the commands too.
                 let _ = opened.send(Ok(info));
@@ -62,7 +67,7 @@ pub fn open(
     let info = opening
         .recv_timeout(ANSWER)
         .map_err(|_| unavailable("does not answer; check power and cable".to_owned()))??;
-    Ok(Box::new(AravisCamera { commands: Some(sender), closed, info, clock, arrivals: None }))
+    Ok(Box::new(AravisCamera { commands: Some(sender), closed, info, clock, arrivals: None, gone }))
 }
 
 struct AravisCamera {
@@ -73,6 +78,8 @@ struct AravisCamera {
     info: CameraInfo,
     clock: Arc<dyn Clock>,
     arrivals: Option<Receiver<Result<Frame, DeviceError>>>,
+    /// Why the camera is gone: its thread may be busy for seconds with letting go of it.
+    gone: Arc<OnceLock<DeviceError>>,
 }
 
 impl AravisCamera {
@@ -90,10 +97,21 @@ impl AravisCamera {
         if !sent {
             return Err(silent("its thread has ended; open it again"));
         }
-        match answer.recv_timeout(ANSWER + extra) {
-            Ok(answer) => answer,
-            Err(RecvTimeoutError::Timeout) => Err(silent("does not answer; check power and cable")),
-            Err(RecvTimeoutError::Disconnected) => Err(silent("its thread has ended; open it again")),
+        let deadline = Instant::now() + ANSWER + extra;
+        loop {
+            match answer.recv_timeout(LOOK) {
+                Ok(answer) => return answer,
+                Err(RecvTimeoutError::Disconnected) => {
+                    return Err(silent("its thread has ended; open it again"));
+                }
+                Err(RecvTimeoutError::Timeout) => {}
+            }
+            if let Some(gone) = self.gone.get() {
+                return Err(gone.clone());
+            }
+            if Instant::now() > deadline {
+                return Err(silent("does not answer; check power and cable"));
+            }
         }
     }
 }
@@ -148,7 +166,10 @@ impl Drop for AravisCamera {
     fn drop(&mut self) {
         self.arrivals = None;
         self.commands = None;
-        // Ends with the sender on the other side; nothing is ever sent.
-        let _ = self.closed.recv_timeout(CLOSING);
+        // One that is gone is let go of in its own time, and cannot be opened before.
+        if self.gone.get().is_none() {
+            // Ends with the sender on the other side; nothing is ever sent.
+            let _ = self.closed.recv_timeout(CLOSING);
+        }
     }
 }

@@ -1,7 +1,7 @@
 //! How the cameras of this process have been doing, over openings and closings.
 
 use std::{
-    collections::{BTreeMap, BTreeSet},
+    collections::{BTreeMap, btree_map::Entry},
     sync::{Arc, LazyLock, Mutex, MutexGuard, PoisonError},
 };
 
@@ -21,7 +21,8 @@ pub struct Health {
 #[derive(Debug, Default)]
 struct State {
     ladders: BTreeMap<String, Ladder>,
-    open: BTreeSet<String>,
+    /// Cameras that are taken, and whether they are lost and only being let go of.
+    open: BTreeMap<String, bool>,
 }
 
 impl Health {
@@ -45,7 +46,12 @@ impl Health {
         match event {
             // Most frames follow frames.
             Event::Delivered => drop(state.ladders.remove(device)),
-            event => state.ladders.entry(device.to_owned()).or_default().enter(now, event),
+            event => {
+                if let Some(closing) = state.open.get_mut(device) {
+                    *closing |= event == Event::Lost;
+                }
+                state.ladders.entry(device.to_owned()).or_default().enter(now, event);
+            }
         }
     }
 
@@ -56,15 +62,23 @@ impl Health {
         (ladder.next(now), now, ladder.failures())
     }
 
-    /// Takes a camera for its only user in this process; `None` where it is taken.
-    pub fn take(&self, device: &str) -> Option<Taken> {
-        let free = self.state().open.insert(device.to_owned());
-        free.then(|| Taken { health: self.clone(), device: device.to_owned() })
+    /// Takes a camera for its only user in this process; why not where it is taken.
+    pub fn take(&self, device: &str) -> Result<Taken, &'static str> {
+        match self.state().open.entry(device.to_owned()) {
+            Entry::Occupied(taken) if *taken.get() => Err(
+                "was lost and is still being let go of, which takes some seconds; it is opened again by itself",
+            ),
+            Entry::Occupied(_) => Err("is open already; close it first"),
+            Entry::Vacant(free) => {
+                free.insert(false);
+                Ok(Taken { health: self.clone(), device: device.to_owned() })
+            }
+        }
     }
 
     /// Whether a camera is taken.
     pub fn is_taken(&self, device: &str) -> bool {
-        self.state().open.contains(device)
+        self.state().open.contains_key(device)
     }
 }
 

@@ -116,10 +116,7 @@ impl CameraDriver for AravisCameras {
             }
             Action::Open | Action::LastResort => {}
         }
-        let taken = self
-            .health
-            .take(&name)
-            .ok_or_else(|| unavailable("is open already; close it first".to_owned()))?;
+        let taken = self.health.take(&name).map_err(|why| unavailable(why.to_owned()))?;
         let opened =
             camera::open(&id, &name, self.options.clone(), self.clock.clone(), self.health.clone(), taken);
         opened.map_err(|error| {
