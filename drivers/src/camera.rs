@@ -56,6 +56,31 @@ pub enum TriggerSource {
     Line0,
 }
 
+/// Settings that a user may let a camera have otherwise than asked, by the names that refusals give them. Format, region,
+/// exposure and trigger are not among them: without these there is no scan.
+pub const ALLOWABLE: [&str; 20] = [
+    "gain_db",
+    "gamma",
+    "black_level",
+    "black_level_auto",
+    "exposure_auto",
+    "gain_auto",
+    "exposure_mode",
+    "frame_rate",
+    "acquisition_mode",
+    "trigger_overlap",
+    "trigger_delay",
+    "binning",
+    "decimation",
+    "isp",
+    "sharpening",
+    "sharpening_auto",
+    "saturation",
+    "lut",
+    "reverse_x",
+    "reverse_y",
+];
+
 /// What the scanner wants of a camera. Everything that would bend a linear response is off and has no setting.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct CameraSettings {

@@ -11,7 +11,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use polscan_drivers::{camera::CameraInfo, projector::ProjectorInfo};
+use polscan_drivers::{camera::CameraInfo, error::DeviceError, projector::ProjectorInfo};
 use polscan_patterns::{Mode, Picture, ProjectorSize, Role, Sequence};
 use tokio::sync::oneshot;
 
@@ -385,6 +385,7 @@ impl Open {
             }
         };
         let taken = scan.capture(&mut self.rig, &mut progress, &job.cancel);
+        shared.metrics.stream(&self.rig.camera.info().serial, taken.statistics());
         Ok(Captured { scan, taken, writer, label: job.label })
     }
 

@@ -48,7 +48,8 @@ pub struct Fake {
     _port: File,
 }
 
-// One register of the camera's memory after another, with the frame before it, by the library's thread.
+/// Called by the library's thread for each exposure.
+// SAFETY: only the library calls it, with what `Fake::on` gave it and a buffer of its own.
 unsafe extern "C" fn fill(
     buffer: *mut ffi::ArvBuffer,
     studio: *mut c_void,

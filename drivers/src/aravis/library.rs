@@ -42,6 +42,7 @@ pub struct Found {
 ///
 /// # Safety
 /// `text` is null or ends with a zero, and stays until the next discovery.
+// SAFETY: the caller has to hold what is written above.
 unsafe fn text(text: *const c_char) -> String {
     if text.is_null() {
         return String::new();
