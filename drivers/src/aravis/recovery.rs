@@ -101,8 +101,8 @@ mod tests {
         Timestamp((seconds * 1e9) as u64)
     }
 
-    /// Does what the ladder says on a camera that never opens, until it gives up; what was done when.
-    fn climb(resets: bool) -> Vec<(f64, Action)> {
+    /// Does what the ladder says on a camera that never opens, until it gives up; what was done after how many ms.
+    fn climb(resets: bool) -> Vec<(u128, Action)> {
         let mut ladder = Ladder::default();
         let mut now = s(100.0);
         ladder.enter(now, Event::Lost);
@@ -114,7 +114,7 @@ mod tests {
                 now = until;
                 continue;
             }
-            done.push((now.seconds() - 100.0, action));
+            done.push((now.since(s(100.0)).as_millis(), action));
             match action {
                 Action::Reset if resets => ladder.enter(now, Event::Reset),
                 _ => ladder.enter(now, Event::OpenFailed),
@@ -125,14 +125,14 @@ mod tests {
 
     #[test]
     fn a_camera_is_tried_ever_more_slowly_then_reset_then_given_to_a_person() {
-        let opens = [0.5, 1.5, 3.5, 8.5, 18.5].map(|at| (at, Action::Open));
+        let opens = [500, 1500, 3500, 8500, 18_500].map(|at| (at, Action::Open));
         let done = climb(true);
         assert_eq!(done[..5], opens);
-        assert_eq!(done[5], (28.5, Action::Reset));
-        assert_eq!(done[6..8], [(38.5, Action::Open), (48.5, Action::Open)]);
+        assert_eq!(done[5], (28_500, Action::Reset));
+        assert_eq!(done[6..8], [(38_500, Action::Open), (48_500, Action::Open)]);
         assert!(done[8..].iter().all(|(_, action)| *action == Action::LastResort), "{done:?}");
         // It is tried for ever: whoever comes with a hand need not restart anything.
-        assert!((done[11].0 - done[10].0 - 10.0).abs() < 1e-9);
+        assert_eq!(done[11].0 - done[10].0, 10_000);
     }
 
     #[test]
