@@ -3,6 +3,8 @@
 //! Settings are written in the order in which cameras unlock them, then all are read, since a later one may have changed
 //! an earlier one. Features that a camera does not have are left out where their absence cannot bend the response.
 //! Binning comes before the region, unlike in the usual order: it decides how large the region can be.
+//!
+//! The file is long because each setting has its own way of being absent, locked or in another unit.
 
 use super::{
     features::{Features, Trouble, Value},
