@@ -1,6 +1,6 @@
 //! The camera seam.
 
-use std::time::Duration;
+use std::{collections::BTreeMap, time::Duration};
 
 use serde::{Deserialize, Serialize};
 
@@ -55,6 +55,31 @@ pub enum TriggerSource {
     /// An electrical edge on the camera's line 0; [`Camera::trigger`] only announces that it will come.
     Line0,
 }
+
+/// Settings that a user may let a camera have otherwise than asked, by the names that refusals give them. Format, region,
+/// exposure and trigger are not among them: without these there is no scan.
+pub const ALLOWABLE: [&str; 20] = [
+    "gain_db",
+    "gamma",
+    "black_level",
+    "black_level_auto",
+    "exposure_auto",
+    "gain_auto",
+    "exposure_mode",
+    "frame_rate",
+    "acquisition_mode",
+    "trigger_overlap",
+    "trigger_delay",
+    "binning",
+    "decimation",
+    "isp",
+    "sharpening",
+    "sharpening_auto",
+    "saturation",
+    "lut",
+    "reverse_x",
+    "reverse_y",
+];
 
 /// What the scanner wants of a camera. Everything that would bend a linear response is off and has no setting.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -121,7 +146,7 @@ pub struct CameraInfo {
 }
 
 /// Counters of a stream since it was armed.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct StreamStatistics {
     /// Triggers sent.
     pub triggers: u64,
@@ -129,6 +154,9 @@ pub struct StreamStatistics {
     pub frames: u64,
     /// Frames that arrived damaged or not at all.
     pub failed: u64,
+    /// Counters of the driver's own, by name.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub counters: BTreeMap<String, u64>,
 }
 
 /// A camera. Calls come in this order, from one thread: `apply`, then any number of rounds of `arm`, pairs of `trigger`
@@ -137,7 +165,7 @@ pub trait Camera: Send {
     /// Identity and abilities.
     fn info(&self) -> &CameraInfo;
 
-    /// Applies all settings and reads each back. Refuses, with the first difference, what it cannot honour exactly
+    /// Applies all settings and reads each back. Refuses, with all differences, what it cannot honour exactly
     /// (exposure within the camera's own step). Only while disarmed.
     fn apply(&mut self, settings: &CameraSettings) -> Result<AppliedSettings, DeviceError>;
 

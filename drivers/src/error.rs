@@ -2,6 +2,23 @@
 
 use thiserror::Error;
 
+/// A setting that a device does not have as asked.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Difference {
+    /// Name of the setting with its unit.
+    pub setting: &'static str,
+    /// Requested value.
+    pub requested: String,
+    /// What the device offers or has read back.
+    pub offered: String,
+}
+
+/// `gamma: asked 1, has 0.8; ...`
+fn listed(differences: &[Difference]) -> String {
+    let one = |d: &Difference| format!("{}: asked {}, has {}", d.setting, d.requested, d.offered);
+    differences.iter().map(one).collect::<Vec<_>>().join("; ")
+}
+
 /// Failure of an operation on a camera or projector.
 #[derive(Debug, Clone, PartialEq, Error)]
 pub enum DeviceError {
@@ -24,6 +41,14 @@ pub enum DeviceError {
         requested: String,
         /// What the device offers or has read back.
         offered: String,
+    },
+    /// The device refuses several settings: change the configuration, or allow them by name.
+    #[error("{device} cannot honour {} settings: {}", differences.len(), listed(differences))]
+    RefusedAll {
+        /// Device.
+        device: String,
+        /// All that differ.
+        differences: Vec<Difference>,
     },
     /// Nothing arrived in time: the caller may try again.
     #[error("{device}: no {awaited} within {timeout_ms} ms")]
@@ -53,4 +78,21 @@ pub enum DeviceError {
         /// State that forbids it.
         state: &'static str,
     },
+}
+
+impl DeviceError {
+    /// The refusal of all `differences`, if there are any.
+    pub fn refused(device: &str, mut differences: Vec<Difference>) -> Option<Self> {
+        let device = device.to_owned();
+        if differences.len() > 1 {
+            return Some(Self::RefusedAll { device, differences });
+        }
+        let Difference { setting, requested, offered } = differences.pop()?;
+        Some(Self::Refused { device, setting, requested, offered })
+    }
+
+    /// Whether the device is well and only refuses what it was asked for.
+    pub fn is_refusal(&self) -> bool {
+        matches!(self, Self::Refused { .. } | Self::RefusedAll { .. })
+    }
 }

@@ -3,6 +3,7 @@
 //! A *driver* finds and opens devices, a *device* operates. The crate knows neither patterns nor the scanner: a
 //! projector is given slides, a camera returns frames, and each carries the evidence of when it happened.
 
+pub mod aravis;
 pub mod camera;
 pub mod clock;
 pub mod error;

@@ -284,7 +284,11 @@ fn frames_carry_their_identity_and_statistics_add_up() {
             // One exposure is left under way.
             open.camera.trigger(open.clock.now()).unwrap();
             let statistics = open.camera.disarm().unwrap();
-            assert_eq!(statistics, StreamStatistics { triggers: 4, frames: 3, failed: 0 }, "{round}");
+            assert_eq!(
+                statistics,
+                StreamStatistics { triggers: 4, frames: 3, failed: 0, ..Default::default() },
+                "{round}"
+            );
             open.camera.arm(4).unwrap();
         }
     }
@@ -332,7 +336,7 @@ fn a_timeout_leaves_the_stream_usable() {
         let frame = open.camera.next_frame(Duration::from_secs(20)).unwrap();
         assert_eq!((frame.stamp.frame_id, frame.stamp.exposure_start), (0, at), "{}", open.name);
         let statistics = open.camera.disarm().unwrap();
-        assert_eq!(statistics, StreamStatistics { triggers: 1, frames: 1, failed: 0 });
+        assert_eq!(statistics, StreamStatistics { triggers: 1, frames: 1, failed: 0, ..Default::default() });
     }
 }
 
@@ -424,7 +428,7 @@ fn a_recording_answers_with_the_frame_of_the_slide() {
     let error = open.camera.next_frame(Duration::from_secs(1)).unwrap_err();
     assert!(matches!(&error, DeviceError::BadData { detail, .. } if detail.contains("black")), "{error}");
     let statistics = open.camera.disarm().unwrap();
-    assert_eq!(statistics, StreamStatistics { triggers: 7, frames: 6, failed: 1 });
+    assert_eq!(statistics, StreamStatistics { triggers: 7, frames: 6, failed: 1, ..Default::default() });
     let other = [slides(), vec![Slide::Uniform(H)]].concat();
     let error = open.projector.load(&other).unwrap_err();
     assert!(

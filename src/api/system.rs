@@ -1,5 +1,7 @@
 //! The service itself: health, status, devices, configuration, metrics, set-up.
 
+use std::collections::BTreeMap;
+
 use axum::{
     Json,
     extract::{Path as Part, State as Shared, rejection::PathRejection},
@@ -99,12 +101,16 @@ pub struct Status {
     /// Projector: driver, model, serial number, size, timing.
     #[schema(value_type = Option<Object>)]
     projector: Option<Value>,
+    /// What the camera's streams counted since the start, by name.
+    camera_stream: BTreeMap<String, u64>,
     /// Picture that the projector holds for set-up.
     showing: Option<String>,
     /// Room for scans.
     storage: StorageStatus,
     /// Version of the program.
     version: &'static str,
+    /// Versions of the libraries that drive devices, by name.
+    libraries: BTreeMap<&'static str, String>,
     /// Seconds since the start.
     uptime_s: f64,
 }
@@ -136,9 +142,11 @@ pub async fn get_status(Shared(app): Shared<App>) -> Json<Status> {
         rig_message: snapshot.rig.message.clone(),
         camera: snapshot.rig.camera.as_ref().map(|camera| json!(camera)),
         projector: snapshot.rig.projector.as_ref().map(|projector| json!(projector)),
+        camera_stream: app.scanner.metrics.stream_totals(),
         showing: snapshot.rig.showing.clone(),
         storage: snapshot.storage,
         version: env!("CARGO_PKG_VERSION"),
+        libraries: app::libraries().into_iter().collect(),
         uptime_s: app.started.elapsed().as_secs_f64(),
     })
 }
@@ -179,13 +187,17 @@ pub async fn get_devices(Shared(app): Shared<App>) -> Result<Json<Devices>, Prob
     .flatten()
     .collect();
     let settings = app.settings.clone();
-    // What a simulated rig consists of does not change, and finding out takes as long as building one.
-    let listed = app.devices.get_or_try_init(|| async {
+    let computed = !app::is_real(&settings);
+    let look = async || {
         app.blocking(move || app::list(&settings))
             .await?
             .map_err(|error| Kind::NotReady.with(error.to_string()))
-    });
-    let (cameras, projectors) = listed.await?;
+    };
+    // What a simulated rig consists of does not change, and finding out takes as long as building one.
+    let (cameras, projectors) = match computed {
+        true => app.devices.get_or_try_init(look).await?.clone(),
+        false => look().await?,
+    };
     let device = |listing: &Listing| Device {
         driver: listing.driver.clone(),
         model: listing.model.clone(),

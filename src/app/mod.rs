@@ -3,6 +3,7 @@
 use std::{path::PathBuf, sync::Arc};
 
 use polscan_drivers::{
+    aravis::{self, AravisCameras},
     camera::{Camera, CameraDriver, Listing},
     clock::{Clock, MonotonicClock, VirtualClock},
     error::DeviceError,
@@ -19,7 +20,7 @@ pub use held::holding;
 pub use twin::without_analyser;
 
 use crate::{
-    config::{DeviceDriver, Settings},
+    config::{DeviceDriver, Settings, UsbMode},
     grid::Grid,
     truth::{Truth, TruthObject},
 };
@@ -137,8 +138,37 @@ fn families(settings: &Settings) -> Result<Families, RigError> {
             knows: Knowledge::Recorded(Box::new(recorded)),
         });
     }
-    let clock = Arc::new(MonotonicClock::start());
-    Ok(Families { cameras: None, projectors: None, clock, knows: Knowledge::Nothing })
+    let clock: Arc<dyn Clock> = Arc::new(MonotonicClock::start());
+    let cameras: Option<Box<dyn CameraDriver>> = match settings.raw.camera.driver {
+        DeviceDriver::Aravis => Some(Box::new(AravisCameras::new(aravis_options(settings), clock.clone()))),
+        DeviceDriver::None | DeviceDriver::Sim | DeviceDriver::Replay => None,
+    };
+    Ok(Families { cameras, projectors: None, clock, knows: Knowledge::Nothing })
+}
+
+fn aravis_options(settings: &Settings) -> aravis::Options {
+    let camera = &settings.raw.camera;
+    aravis::Options {
+        allow: camera.allow.clone(),
+        gain_raw: camera.gain_raw,
+        black_level: camera.black_level,
+        usb_mode: match camera.usb_mode {
+            UsbMode::Sync => aravis::UsbMode::Sync,
+            UsbMode::Async => aravis::UsbMode::Async,
+        },
+    }
+}
+
+/// Whether devices that the settings name come and go with plugs.
+pub fn is_real(settings: &Settings) -> bool {
+    let drivers = [settings.raw.camera.driver, settings.raw.projector.driver];
+    drivers.contains(&DeviceDriver::Aravis)
+}
+
+/// What the drivers stand on, with its version: `(name, version)`.
+pub fn libraries() -> Vec<(&'static str, String)> {
+    let [major, minor, micro] = aravis::version();
+    vec![("aravis", format!("{major}.{minor}.{micro}"))]
 }
 
 fn truth_maps(truth: &sim::Truth) -> Truth {

@@ -2,7 +2,7 @@
 
 use crate::{
     app,
-    config::Settings,
+    config::{DeviceDriver, Settings},
     engine::{Failure, rig_failure},
 };
 
@@ -15,7 +15,13 @@ pub fn devices(settings: &Settings, json: bool) -> Result<u8, Failure> {
     }
     for (kind, found) in [("camera", cameras), ("projector", projectors)] {
         if found.is_empty() {
-            super::say(format_args!("{kind}: none; set {kind}.driver in the file given with --config"));
+            let driver =
+                if kind == "camera" { settings.raw.camera.driver } else { settings.raw.projector.driver };
+            let next = match driver {
+                DeviceDriver::None => format!("set {kind}.driver in the file given with --config"),
+                _ => "check power and cable".to_owned(),
+            };
+            super::say(format_args!("{kind}: none; {next}"));
         }
         for device in found {
             let state = device.unusable.as_deref().unwrap_or("usable");

@@ -420,6 +420,19 @@ mod tests {
     }
 
     #[test]
+    fn what_a_camera_may_have_otherwise_is_checked_by_name() {
+        let camera = |allow: &str| format!("[camera]\ndriver = \"aravis\"\nallow = {allow}\n");
+        let settings = load(&camera("[\"gamma\"]\ngain_raw = 0\ntrigger = \"line0\""), Vec::new()).unwrap();
+        assert_eq!(settings.raw.camera.allow, ["gamma"]);
+        assert_eq!((settings.raw.camera.gain_raw, settings.raw.camera.black_level), (Some(0.0), None));
+        assert_eq!(settings.camera.trigger, polscan_drivers::camera::TriggerSource::Line0);
+        // Without a format there is no frame, so that nothing but a mistake allows another.
+        assert_eq!(load(&camera("[\"gama\", \"format\"]"), Vec::new()).unwrap_err(), ["camera.allow"; 2]);
+        let projector = "[projector]\ndriver = \"aravis\"";
+        assert_eq!(load(projector, Vec::new()).unwrap_err(), ["projector.driver"]);
+    }
+
+    #[test]
     fn defaults_of_file_and_code_agree() {
         let settings = Layers::default().load().unwrap();
         assert_eq!(settings.thresholds, crate::decode::Thresholds::default());

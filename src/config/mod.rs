@@ -6,5 +6,5 @@ mod raw;
 mod settings;
 
 pub use layers::{ConfigError, Fault, Layers, Override};
-pub use raw::{DeviceDriver, Raw};
+pub use raw::{DeviceDriver, Raw, UsbMode};
 pub use settings::{RigCalibration, Settings};

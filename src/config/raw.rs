@@ -1,6 +1,9 @@
 //! The configuration file as it is written: a plain mirror for serde.
 
-use polscan_drivers::{camera::PixelFormat, sim::RigDescription};
+use polscan_drivers::{
+    camera::{PixelFormat, TriggerSource},
+    sim::RigDescription,
+};
 use polscan_patterns::Mode;
 use serde::{Deserialize, Serialize};
 
@@ -125,6 +128,18 @@ pub enum DeviceDriver {
     Sim,
     /// A recorded bundle, given again.
     Replay,
+    /// GenICam cameras by the Aravis library.
+    Aravis,
+}
+
+/// How USB cameras of the driver `aravis` send.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum UsbMode {
+    /// One transfer after the other.
+    Sync,
+    /// Many transfers at once.
+    Async,
 }
 
 /// `[replay]`
@@ -153,6 +168,18 @@ pub struct Camera {
     pub format: PixelFormat,
     /// Part of the sensor; empty is all of it.
     pub region: RegionTable,
+    /// What starts an exposure.
+    pub trigger: TriggerSource,
+    /// Settings that the camera may have otherwise.
+    pub allow: Vec<String>,
+    /// The camera's own value for `gain_db`, where its unit is another.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub gain_raw: Option<f64>,
+    /// Black level in the camera's own unit, where it is to be set.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub black_level: Option<f64>,
+    /// How USB cameras send.
+    pub usb_mode: UsbMode,
 }
 
 /// `region` of `[camera]`: all four keys or none.

@@ -6,7 +6,7 @@ use std::{
 };
 
 use polscan_drivers::{
-    camera::{CameraSettings, Region, TriggerSource},
+    camera::{ALLOWABLE, CameraSettings, Region},
     sim::{RigDescription, Scene},
 };
 use polscan_patterns::{ChannelSet, Mode, Polarization};
@@ -100,7 +100,7 @@ impl Settings {
                 gamma: raw.camera.gamma,
                 region,
                 format: raw.camera.format,
-                trigger: TriggerSource::Software,
+                trigger: raw.camera.trigger,
             },
             polarization: polarization?,
             thresholds: Thresholds {
@@ -156,6 +156,13 @@ fn check_ranges(raw: &Raw, faults: &mut Faults) {
     }
     if raw.store.dir.is_empty() {
         faults.push(("store.dir".into(), "empty; name a folder".into()));
+    }
+    for name in raw.camera.allow.iter().filter(|name| !ALLOWABLE.contains(&name.as_str())) {
+        let message = format!("`{name}` is none of {}", ALLOWABLE.join(", "));
+        faults.push(("camera.allow".into(), message));
+    }
+    if raw.projector.driver == DeviceDriver::Aravis {
+        faults.push(("projector.driver".into(), "aravis drives cameras only".into()));
     }
     let pair = [raw.camera.driver, raw.projector.driver];
     for (driver, name) in [(DeviceDriver::Sim, "simulated"), (DeviceDriver::Replay, "replaying")] {

@@ -172,7 +172,7 @@ fn summary(sequence: &[Role], capture: &Capture) -> CaptureSummary {
         retaken: capture.retaken.clone(),
         references_retaken: capture.notes.references_retaken.clone(),
         discarded: capture.notes.discarded.clone(),
-        statistics: capture.statistics,
+        statistics: capture.statistics.clone(),
         ..CaptureSummary::default()
     }
     .with_evidence(&evidence)

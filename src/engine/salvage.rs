@@ -60,7 +60,7 @@ pub fn salvage(spooled: Spooled, reason: Reason, writer: BundleWriter) -> Result
         timing_measured,
         applied,
         // Its own counters died with the process.
-        statistics: StreamStatistics { triggers: count, frames: count, failed: 0 },
+        statistics: StreamStatistics { triggers: count, frames: count, ..StreamStatistics::default() },
         notes: capture.notes,
     };
     manifest.sequence = record.frames.iter().map(|captured| captured.role).collect();

@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use polscan_drivers::{
-    camera::{AppliedSettings, CameraInfo},
+    camera::{AppliedSettings, CameraInfo, StreamStatistics},
     projector::ProjectorInfo,
 };
 use polscan_patterns::{Mode, ProjectorSize, Role, Sequence};
@@ -76,6 +76,11 @@ impl Taken {
     /// Why the capture did not come to its end; its frames are kept all the same.
     pub fn failure(&self) -> Option<&Reason> {
         self.failure.as_ref()
+    }
+
+    /// What the camera's stream counted.
+    pub fn statistics(&self) -> &StreamStatistics {
+        &self.record.statistics
     }
 
     /// What the rig knows of its scene, for a simulated one.

@@ -48,7 +48,7 @@ impl From<&CaptureRecord> for CaptureSummary {
             retaken: record.retaken.clone(),
             references_retaken: record.notes.references_retaken.clone(),
             discarded: record.notes.discarded.clone(),
-            statistics: record.statistics,
+            statistics: record.statistics.clone(),
             early: Vec::new(),
             shared_slide: Vec::new(),
         }
@@ -75,7 +75,7 @@ impl CaptureSummary {
 
     /// Exposures that were asked for and gave no whole frame.
     pub fn lost_frames(&self) -> u64 {
-        let StreamStatistics { triggers, frames, failed } = self.statistics;
+        let StreamStatistics { triggers, frames, failed, .. } = self.statistics;
         failed.max(triggers.saturating_sub(frames))
     }
 }
@@ -141,7 +141,7 @@ mod tests {
                 readout_us: 0.0,
                 noise: None,
             },
-            statistics: StreamStatistics { triggers: 7, frames: 5, failed: 1 },
+            statistics: StreamStatistics { triggers: 7, frames: 5, failed: 1, ..StreamStatistics::default() },
             notes: Default::default(),
         }
     }
@@ -164,7 +164,7 @@ mod tests {
     #[test]
     fn a_sound_capture_has_nothing_to_list() {
         let mut record = record(vec![frame(Role::White, 0, 1, 2), frame(Role::Black, 1, 3, 4)]);
-        record.statistics = StreamStatistics { triggers: 2, frames: 2, failed: 0 };
+        record.statistics = StreamStatistics { triggers: 2, frames: 2, ..StreamStatistics::default() };
         let summary = CaptureSummary::from(&record);
         assert!(summary.early.is_empty() && summary.shared_slide.is_empty());
         assert_eq!(summary.lost_frames(), 0);

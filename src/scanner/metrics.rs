@@ -1,7 +1,11 @@
 //! What monitoring may know. Base units, no identities as labels.
 
-use std::sync::atomic::AtomicU64;
+use std::{
+    collections::BTreeMap,
+    sync::{Mutex, PoisonError, atomic::AtomicU64},
+};
 
+use polscan_drivers::camera::StreamStatistics;
 use prometheus_client::{
     encoding::text::encode,
     metrics::{counter::Counter, family::Family, gauge::Gauge, histogram::Histogram, info::Info},
@@ -18,6 +22,9 @@ pub struct Metrics {
     scans: Family<Labels<1>, Counter>,
     frames: Family<Labels<2>, Counter>,
     requests: Family<Labels<2>, Counter>,
+    stream: Family<Labels<2>, Counter>,
+    /// The same since the start, for people.
+    stream_totals: Mutex<BTreeMap<String, u64>>,
     /// From the POST of a scan, or the release of a queued one, to its end.
     pub scan_duration: Histogram,
     /// From trigger to frame in memory.
@@ -49,6 +56,8 @@ impl Default for Metrics {
             scans: Family::default(),
             frames: Family::default(),
             requests: Family::default(),
+            stream: Family::default(),
+            stream_totals: Mutex::default(),
             scan_duration: Histogram::new(scan_buckets),
             trigger_to_frame: Histogram::new(frame_buckets),
             present_phase_error: Seconds::default(),
@@ -71,6 +80,7 @@ impl Metrics {
         registry.register("scans", "Scans by result", self.scans.clone());
         registry.register("frames", "Frames by camera and status", self.frames.clone());
         registry.register("http_requests", "Requests by route and status", self.requests.clone());
+        registry.register("camera_stream", "What the camera's driver counted", self.stream.clone());
         let duration = "From acceptance to result";
         registry.register_with_unit("scan_duration", duration, Unit::Seconds, self.scan_duration.clone());
         let latency = "From trigger to frame in memory";
@@ -124,6 +134,25 @@ impl Metrics {
             .inc_by(count);
     }
 
+    /// Counts what a camera's stream counted from arming to disarming.
+    pub fn stream(&self, camera: &str, statistics: &StreamStatistics) {
+        let StreamStatistics { triggers, frames, failed, counters } = statistics;
+        let own = [("triggers", *triggers), ("frames", *frames), ("failed", *failed)];
+        let all = own.into_iter().chain(counters.iter().map(|(name, count)| (name.as_str(), *count)));
+        let mut totals = self.stream_totals.lock().unwrap_or_else(PoisonError::into_inner);
+        for (name, count) in all {
+            let labels = [("camera", camera.to_owned()), ("name", name.to_owned())];
+            self.stream.get_or_create(&labels).inc_by(count);
+            let total = totals.entry(name.to_owned()).or_default();
+            *total = total.saturating_add(count);
+        }
+    }
+
+    /// What all streams counted so far, by name.
+    pub fn stream_totals(&self) -> BTreeMap<String, u64> {
+        self.stream_totals.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
     /// Counts a request.
     pub fn request(&self, route: &str, status: u16) {
         self.requests.get_or_create(&[("route", route.to_owned()), ("status", status.to_string())]).inc();
@@ -148,10 +177,17 @@ mod tests {
         metrics.scan("done");
         metrics.frames("sim-0", "ok", 44);
         metrics.request("/v1/scans", 202);
+        let counters = BTreeMap::from([("n_missing_packets".to_owned(), 5)]);
+        let statistics = StreamStatistics { triggers: 44, frames: 43, failed: 1, counters };
+        metrics.stream("sim-0", &statistics);
+        metrics.stream("sim-0", &statistics);
+        assert_eq!(metrics.stream_totals()["failed"], 2);
         let text = metrics.text();
         for line in [
             "polscan_scans_total{result=\"done\"} 1",
             "polscan_frames_total{camera=\"sim-0\",status=\"ok\"} 44",
+            "polscan_camera_stream_total{camera=\"sim-0\",name=\"n_missing_packets\"} 10",
+            "polscan_camera_stream_total{camera=\"sim-0\",name=\"triggers\"} 88",
             "polscan_scan_duration_seconds_count 0",
             "polscan_trigger_to_frame_seconds_count 0",
             "polscan_present_phase_error_seconds 0",

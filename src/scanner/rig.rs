@@ -327,9 +327,8 @@ impl Open {
             }
             Ok(Err(failure)) => {
                 // A device that refuses a setting is well.
-                let refused = |source: &DeviceError| matches!(source, DeviceError::Refused { .. });
                 let broken = match &failure {
-                    Failure::Device { source, .. } if !refused(source) => Some(failure.chain()),
+                    Failure::Device { source, .. } if !source.is_refusal() => Some(failure.chain()),
                     _ => None,
                 };
                 (News::Refused { id, failure }, broken)
@@ -386,6 +385,7 @@ impl Open {
             }
         };
         let taken = scan.capture(&mut self.rig, &mut progress, &job.cancel);
+        shared.metrics.stream(&self.rig.camera.info().serial, taken.statistics());
         Ok(Captured { scan, taken, writer, label: job.label })
     }
 

@@ -404,7 +404,8 @@ impl Shell<'_> {
             // A camera that was not armed may refuse to be disarmed.
             _ => None,
         };
-        if let Some(statistics) = statistics.filter(|_| prepared.is_ok() && self.rig.camera.info().triggered)
+        if let Some(statistics) =
+            statistics.as_ref().filter(|_| prepared.is_ok() && self.rig.camera.info().triggered)
         {
             let (triggers, frames) = (machine.triggers(), self.received);
             if statistics.triggers < triggers || statistics.frames != frames {
@@ -430,7 +431,7 @@ impl Shell<'_> {
                 let statistics = statistics.unwrap_or(StreamStatistics {
                     triggers: machine.triggers(),
                     frames: self.received,
-                    failed: 0,
+                    ..StreamStatistics::default()
                 });
                 return Ok(self.record(frames, retaken, seconds, statistics, notes));
             }

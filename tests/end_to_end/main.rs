@@ -7,6 +7,7 @@ mod captures_of_the_twin;
 #[allow(dead_code, reason = "the suite of faults needs more of it")]
 mod cases;
 mod compare;
+mod devices;
 mod faults;
 mod patterns;
 mod projection;

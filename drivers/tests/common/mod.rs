@@ -1,6 +1,8 @@
 //! Rigs and scenes for the tests, and short cuts to operate them.
 #![allow(dead_code, reason = "each test binary uses its own part")]
 
+pub mod blackfly;
+
 use std::{path::PathBuf, sync::Arc, time::Duration};
 
 use polscan_drivers::{

@@ -772,7 +772,7 @@ mod tests {
         let decoded = testing::decoded(40, 30);
         let mut capture = CaptureSummary {
             timing_measured: true,
-            statistics: StreamStatistics { triggers: 44, frames: 44, failed: 0 },
+            statistics: StreamStatistics { triggers: 44, frames: 44, ..StreamStatistics::default() },
             ..CaptureSummary::default()
         };
         change(&mut capture);

@@ -370,7 +370,7 @@ impl Manifest {
             latency_ms: record.latency_ms,
             hold_refreshes: record.hold_refreshes,
             timing_measured: record.timing_measured,
-            statistics: record.statistics,
+            statistics: record.statistics.clone(),
             frames: record
                 .frames
                 .iter()

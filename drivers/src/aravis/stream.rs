@@ -1,0 +1,274 @@
+//! A stream between `arm` and `disarm`: buffers in, frames out, everything counted.
+
+use std::{
+    collections::{BTreeMap, HashSet},
+    sync::{
+        Arc,
+        mpsc::{Receiver, Sender, channel},
+    },
+    time::Duration,
+};
+
+use aravis::{
+    Buffer, BufferPayloadType, BufferStatus, Stream,
+    glib::{object::ObjectType, types::Type},
+    prelude::*,
+};
+
+use super::{
+    buffers::{self, Lent},
+    checklist::Applied,
+    features::Features,
+    identity::{FrameIds, Pairing},
+};
+use crate::{
+    camera::StreamStatistics,
+    clock::{Clock, Timestamp},
+    error::DeviceError,
+    frame::{Frame, FrameStamp, PixelStore},
+};
+
+/// Buffers beyond the frames that will be asked for. With as few of them left, frames are copied rather than lent.
+const SPARE_BUFFERS: usize = 6;
+
+/// Most buffers of one stream, whatever is asked for.
+const MOST_BUFFERS: usize = 256;
+
+/// Buffers that outlive a stream: the same ones are used over and over.
+#[derive(Debug)]
+pub struct Pool {
+    buffers: Vec<Buffer>,
+    /// Addresses of those that are lent to somebody.
+    lent: HashSet<usize>,
+    size: usize,
+    home: Sender<Buffer>,
+    returned: Receiver<Buffer>,
+}
+
+fn address(buffer: &Buffer) -> usize {
+    buffer.as_ptr() as usize
+}
+
+impl Pool {
+    /// An empty pool.
+    pub fn new() -> Self {
+        let (home, returned) = channel();
+        Self { buffers: Vec::new(), lent: HashSet::new(), size: 0, home, returned }
+    }
+
+    /// Makes buffers of `size` bytes for `frames` frames, those that are lent not counted.
+    fn prepare(&mut self, size: usize, frames: usize) {
+        while self.returned.try_recv().is_ok_and(|buffer| self.lent.remove(&address(&buffer))) {}
+        if size != self.size {
+            *self = Self { size, ..Self::new() };
+        }
+        let wanted = (frames + SPARE_BUFFERS).min(MOST_BUFFERS) + self.lent.len();
+        while self.buffers.len() < wanted {
+            self.buffers.push(Buffer::new_allocate(size));
+        }
+    }
+
+    fn free(&self) -> impl Iterator<Item = &Buffer> {
+        self.buffers.iter().filter(|buffer| !self.lent.contains(&address(buffer)))
+    }
+
+    /// A buffer that has come back.
+    fn take_returned(&mut self) -> Option<Buffer> {
+        let buffer = self.returned.try_recv().ok()?;
+        self.lent.remove(&address(&buffer));
+        Some(buffer)
+    }
+}
+
+/// A stream that runs.
+pub struct Running {
+    /// Dropped first, and before the camera.
+    stream: Stream,
+    applied: Applied,
+    arrivals: Sender<Result<Frame, DeviceError>>,
+    device: String,
+    clock: Arc<dyn Clock>,
+    ids: FrameIds,
+    pairing: Pairing,
+    frames: u64,
+    failed: u64,
+    copied: u64,
+    /// Before this the sensor is busy.
+    ready: Timestamp,
+}
+
+impl Running {
+    /// Starts a stream of `applied` for `frames` frames that go to `arrivals`.
+    pub fn start(
+        features: &Features,
+        pool: &mut Pool,
+        applied: &Applied,
+        frames: usize,
+        device: &str,
+        clock: Arc<dyn Clock>,
+        arrivals: Sender<Result<Frame, DeviceError>>,
+    ) -> Result<Self, DeviceError> {
+        let failed = |what: &str, error: aravis::glib::Error| DeviceError::Unavailable {
+            device: device.to_owned(),
+            detail: format!("{what} failed ({}); check cable and power, then try again", error.message()),
+        };
+        let camera = features.camera();
+        let payload = camera.payload().map_err(|error| failed("reading the size of a frame", error))?;
+        let least = applied.wire.bytes(applied.region.width as usize * applied.region.height as usize);
+        if (payload as usize) < least {
+            return Err(DeviceError::BadData {
+                device: device.to_owned(),
+                detail: format!("announces frames of {payload} bytes, {least} are needed"),
+            });
+        }
+        pool.prepare(payload as usize, frames);
+        let stream = camera.create_stream().map_err(|error| failed("opening the stream", error))?;
+        stream.set_emit_signals(false);
+        for buffer in pool.free() {
+            stream.push_buffer(buffer.clone());
+        }
+        camera.start_acquisition().map_err(|error| failed("starting the acquisition", error))?;
+        Ok(Self {
+            stream,
+            applied: applied.clone(),
+            arrivals,
+            device: device.to_owned(),
+            clock,
+            ids: FrameIds::new(camera.is_gv_device()),
+            pairing: Pairing::default(),
+            frames: 0,
+            failed: 0,
+            copied: 0,
+            ready: Timestamp(0),
+        })
+    }
+
+    /// When a trigger for `at` can be sent.
+    pub fn earliest(&self, at: Timestamp) -> Timestamp {
+        at.max(self.ready).max(self.clock.now())
+    }
+
+    /// A trigger was sent for `start`.
+    pub fn triggered(&mut self, start: Timestamp) {
+        let us = |us: f64| Duration::try_from_secs_f64(1e-6 * us).unwrap_or_default();
+        let settings = &self.applied.settings;
+        // One frame is read out while the next is exposed, but not two at once.
+        self.ready = start + us(settings.settings.exposure_us).max(us(settings.readout_us));
+        self.pairing.sent(start);
+    }
+
+    /// Waits for a buffer and passes on what is in it; whether that was a whole frame.
+    pub fn poll(&mut self, pool: &mut Pool, timeout: Duration) -> bool {
+        while let Some(buffer) = pool.take_returned() {
+            self.stream.push_buffer(buffer);
+        }
+        let Some(buffer) = self.stream.timeout_pop_buffer(timeout.as_micros() as u64) else { return false };
+        let received = self.clock.now();
+        let raw = buffer.frame_id();
+        let frame_id = self.ids.enter(raw);
+        let device_ns = Some(buffer.timestamp()).filter(|&ns| ns != 0);
+        let (trigger, exposure_start) = self.pairing.answer(device_ns, received);
+        if let Some(fault) = self.fault(&buffer) {
+            self.stream.push_buffer(buffer);
+            self.failed += 1;
+            let detail = format!("frame {frame_id} (number {raw} of the camera): {fault}");
+            let _ = self.arrivals.send(Err(DeviceError::BadData { device: self.device.clone(), detail }));
+            return false;
+        }
+        self.frames += 1;
+        let settings = &self.applied.settings;
+        let frame = Frame {
+            width: settings.width,
+            height: settings.height,
+            bit_depth: settings.settings.format.bit_depth(),
+            stamp: FrameStamp { frame_id, trigger, exposure_start, received, device_time_ns: device_ns },
+            store: self.store(buffer, pool),
+        };
+        let _ = self.arrivals.send(Ok(frame));
+        true
+    }
+
+    /// Why what is in a buffer is not a frame as it was configured.
+    fn fault(&self, buffer: &Buffer) -> Option<String> {
+        let status = match buffer.status() {
+            BufferStatus::Success => None,
+            BufferStatus::Timeout | BufferStatus::MissingPackets => {
+                Some("packets were lost on the way; check cable, switch and packet size")
+            }
+            BufferStatus::SizeMismatch => Some("it is of another size than announced"),
+            BufferStatus::Aborted => Some("it was cut off"),
+            BufferStatus::WrongPacketId => Some("its packets are numbered wrongly"),
+            BufferStatus::PayloadNotSupported => Some("it is of a kind that cannot be read"),
+            _ => Some("it did not arrive whole"),
+        };
+        if let Some(fault) = status {
+            return Some(format!("{fault} ({:?})", buffer.status()));
+        }
+        let Applied { wire, region, .. } = &self.applied;
+        if buffer.payload_type() != BufferPayloadType::Image {
+            return Some(format!("it holds {:?}, not an image", buffer.payload_type()));
+        }
+        let code = buffer.image_pixel_format().raw();
+        if code != wire.code() {
+            return Some(format!("its samples are of format {code:#x}, {} was configured", wire.name()));
+        }
+        let (x, y, width, height) = buffer.image_region();
+        let configured = [region.x, region.y, region.width, region.height].map(i64::from);
+        if [x, y, width, height].map(i64::from) != configured {
+            return Some(format!("its region is {width} x {height} at ({x}, {y}), not the configured one"));
+        }
+        if buffer.image_padding() != (0, 0) {
+            return Some("its rows are padded".to_owned());
+        }
+        let (length, needed) = (buffers::received(buffer).len(), wire.bytes(self.samples()));
+        (length < needed).then(|| format!("it has {length} bytes, {needed} are needed"))
+    }
+
+    fn samples(&self) -> usize {
+        self.applied.region.width as usize * self.applied.region.height as usize
+    }
+
+    /// Lends the buffer where its samples can be used as they lie and enough others are left, else copies.
+    fn store(&mut self, buffer: Buffer, pool: &mut Pool) -> Arc<dyn PixelStore> {
+        let (wire, samples) = (self.applied.wire, self.samples());
+        let (waiting, done) = self.stream.n_buffers();
+        let enough = waiting + done >= SPARE_BUFFERS as i32 / 2;
+        let buffer = if wire.is_native() && enough {
+            let home = address(&buffer);
+            match Lent::new(buffer, samples, wire.bytes(1) == 2, pool.home.clone()) {
+                Ok(lent) => {
+                    pool.lent.insert(home);
+                    return Arc::new(lent);
+                }
+                Err(buffer) => buffer,
+            }
+        } else {
+            buffer
+        };
+        let unpacked = wire.unpack(buffers::received(&buffer), samples);
+        self.copied += 1;
+        self.stream.push_buffer(buffer);
+        Arc::new(unpacked)
+    }
+
+    /// Counters so far, those of the library with them.
+    pub fn statistics(&self) -> StreamStatistics {
+        let mut counters = BTreeMap::from([("copied_frames".to_owned(), self.copied)]);
+        for id in 0..self.stream.n_infos() {
+            if let Some(name) = self.stream.info_name(id).filter(|_| self.stream.info_type(id) == Type::U64) {
+                counters.insert(name.to_string(), self.stream.info_uint64(id));
+            }
+        }
+        StreamStatistics {
+            triggers: self.pairing.count(),
+            frames: self.frames,
+            failed: self.failed,
+            counters,
+        }
+    }
+
+    /// Tells whoever waits for frames that none will come.
+    pub fn fail(&self, error: &DeviceError) {
+        let _ = self.arrivals.send(Err(error.clone()));
+    }
+}
