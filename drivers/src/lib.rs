@@ -10,3 +10,4 @@ pub mod frame;
 pub mod projector;
 pub mod replay;
 pub mod sim;
+pub mod window;

@@ -13,8 +13,10 @@ use thiserror::Error;
 
 mod replay;
 mod twin;
+mod window;
 
 pub use twin::without_analyser;
+pub use window::{WindowError, serve_projector};
 
 use crate::{
     config::{DeviceDriver, Settings},
@@ -67,14 +69,12 @@ impl Rig {
     /// Opens what the settings ask for.
     pub fn open(settings: &Settings) -> Result<Self, RigError> {
         let Families { cameras, projectors, clock, knows } = families(settings)?;
-        let (camera, projector) = (&settings.raw.camera, &settings.raw.projector);
         let cameras = cameras.ok_or(RigError::NotConfigured("camera"))?;
         let projectors = projectors.ok_or(RigError::NotConfigured("projector"))?;
-        let some = |serial: &str| (!serial.is_empty()).then(|| serial.to_string());
         Ok(Self {
             clock,
-            camera: cameras.open(some(&camera.serial).as_deref())?,
-            projector: projectors.open(some(&projector.serial).as_deref())?,
+            camera: cameras.open(named(&settings.raw.camera.serial))?,
+            projector: projectors.open(named(&settings.raw.projector.serial))?,
             knows,
         })
     }
@@ -96,6 +96,18 @@ impl Rig {
             Knowledge::Recorded(recorded) => recorded.truth.clone(),
         }
     }
+}
+
+/// Opens the projector alone, with the clock of its receipts: for pictures that no camera needs to see.
+pub fn open_projector(settings: &Settings) -> Result<(Box<dyn Projector>, Arc<dyn Clock>), RigError> {
+    let Families { projectors, clock, .. } = families(settings)?;
+    let projectors = projectors.ok_or(RigError::NotConfigured("projector"))?;
+    Ok((projectors.open(named(&settings.raw.projector.serial))?, clock))
+}
+
+/// A serial number of the configuration, where an empty one stands for the only device there is.
+fn named(serial: &str) -> Option<&str> {
+    (!serial.is_empty()).then_some(serial)
 }
 
 /// All cameras and all projectors that the configured drivers find.
@@ -135,8 +147,9 @@ fn families(settings: &Settings) -> Result<Families, RigError> {
             knows: Knowledge::Recorded(Box::new(recorded)),
         });
     }
-    let clock = Arc::new(MonotonicClock::start());
-    Ok(Families { cameras: None, projectors: None, clock, knows: Knowledge::Nothing })
+    let clock: Arc<dyn Clock> = Arc::new(MonotonicClock::start());
+    let projectors = window::projectors(settings, &clock);
+    Ok(Families { cameras: None, projectors, clock, knows: Knowledge::Nothing })
 }
 
 fn truth_maps(truth: &sim::Truth) -> Truth {

@@ -11,6 +11,7 @@ mod patterns;
 mod progress;
 mod scan;
 mod serve;
+mod show;
 
 use std::{io::Write, path::Path};
 
@@ -25,6 +26,7 @@ pub use failure::{USAGE, exit_code, print_failure, print_usage};
 pub use patterns::{Size, patterns};
 pub use scan::scan;
 pub use serve::serve;
+pub use show::{projector, show};
 
 /// Prints a line to stdout. A reader that has gone away is no error of ours.
 fn say(text: impl std::fmt::Display) {

@@ -119,6 +119,8 @@ pub enum DeviceDriver {
     Sim,
     /// A recorded bundle, given again.
     Replay,
+    /// A full-screen window; projectors only.
+    Window,
 }
 
 /// `[replay]`
@@ -183,6 +185,14 @@ pub struct Projector {
     pub hold_refreshes: u32,
     /// Flip to trigger in ms, 0 = as timing demands.
     pub trigger_delay_ms: f64,
+    /// Columns and rows of the display's mode, empty = any.
+    pub size: Vec<u32>,
+    /// Its refreshes per second, 0 = any.
+    pub refresh_hz: f64,
+    /// X server of the window, empty = that of DISPLAY.
+    pub x11_display: String,
+    /// Socket of a projector process that runs already, empty = start one.
+    pub socket: String,
 }
 
 /// `[capture]`
