@@ -180,13 +180,21 @@ pub async fn get_devices(Shared(app): Shared<App>) -> Result<Json<Devices>, Prob
     .flatten()
     .collect();
     let settings = app.settings.clone();
-    // What a simulated rig consists of does not change, and finding out takes as long as building one.
-    let listed = app.devices.get_or_try_init(|| async {
+    let constant = settings.sim.is_some() || settings.replay.is_some();
+    let look = || async {
         app.blocking(move || app::list(&settings))
             .await?
             .map_err(|error| Kind::NotReady.with(error.to_string()))
-    });
-    let (cameras, projectors) = listed.await?;
+    };
+    // What a simulated rig consists of does not change, and finding out takes as long as building one.
+    let found;
+    let (cameras, projectors) = match constant {
+        true => app.devices.get_or_try_init(look).await?,
+        false => {
+            found = look().await?;
+            &found
+        }
+    };
     let device = |listing: &Listing| Device {
         driver: listing.driver.clone(),
         model: listing.model.clone(),

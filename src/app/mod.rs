@@ -98,11 +98,21 @@ impl Rig {
     }
 }
 
-/// Opens the projector alone, with the clock of its receipts: for pictures that no camera needs to see.
-pub fn open_projector(settings: &Settings) -> Result<(Box<dyn Projector>, Arc<dyn Clock>), RigError> {
-    let Families { projectors, clock, .. } = families(settings)?;
-    let projectors = projectors.ok_or(RigError::NotConfigured("projector"))?;
-    Ok((projectors.open(named(&settings.raw.projector.serial))?, clock))
+/// A projector without a camera, for pictures that no camera needs to see.
+pub struct Beam {
+    /// Projector.
+    pub projector: Box<dyn Projector>,
+    /// Clock of its receipts.
+    pub clock: Arc<dyn Clock>,
+}
+
+impl Beam {
+    /// Opens the projector that the settings ask for.
+    pub fn open(settings: &Settings) -> Result<Self, RigError> {
+        let Families { projectors, clock, .. } = families(settings)?;
+        let projectors = projectors.ok_or(RigError::NotConfigured("projector"))?;
+        Ok(Self { projector: projectors.open(named(&settings.raw.projector.serial))?, clock })
+    }
 }
 
 /// A serial number of the configuration, where an empty one stands for the only device there is.
@@ -110,11 +120,21 @@ fn named(serial: &str) -> Option<&str> {
     (!serial.is_empty()).then_some(serial)
 }
 
-/// All cameras and all projectors that the configured drivers find.
+/// All cameras and all projectors that the configured drivers find. Where a driver cannot look, that is what is listed.
 pub fn list(settings: &Settings) -> Result<(Vec<Listing>, Vec<Listing>), RigError> {
     let Families { cameras, projectors, .. } = families(settings)?;
-    let cameras = cameras.map_or(Ok(Vec::new()), |driver| driver.list())?;
-    Ok((cameras, projectors.map_or(Ok(Vec::new()), |driver| driver.list())?))
+    let blind = |driver: DeviceDriver, model: &str, error: DeviceError| Listing {
+        driver: driver.name().to_owned(),
+        model: model.to_owned(),
+        serial: String::new(),
+        unusable: Some(error.to_string()),
+    };
+    let cameras = cameras.map_or(Ok(Vec::new()), |driver| driver.list());
+    let projectors = projectors.map_or(Ok(Vec::new()), |driver| driver.list());
+    Ok((
+        cameras.unwrap_or_else(|error| vec![blind(settings.raw.camera.driver, "any camera", error)]),
+        projectors.unwrap_or_else(|error| vec![blind(settings.raw.projector.driver, "any projector", error)]),
+    ))
 }
 
 /// The configured drivers; `None` for a device that is not configured.

@@ -4,7 +4,7 @@ use std::{path::Path, time::Duration};
 
 use super::scan::cancel_on_interrupt;
 use crate::{
-    app,
+    app::{self, Beam},
     config::Settings,
     engine::{Failure, Shown, hold, rig_failure},
     sequencer::CancelFlag,
@@ -20,7 +20,7 @@ const LOOKS: u32 = 20;
 pub fn show(settings: &Settings, shown: Shown, name: &str, json: bool) -> Result<u8, Failure> {
     let cancel = CancelFlag::default();
     cancel_on_interrupt(&cancel);
-    let (mut projector, clock) = app::open_projector(settings).map_err(rig_failure)?;
+    let Beam { mut projector, clock } = Beam::open(settings).map_err(rig_failure)?;
     hold(shown, settings, projector.as_mut(), clock.as_ref())?;
     let info = projector.info();
     if json {

@@ -123,6 +123,18 @@ pub enum DeviceDriver {
     Window,
 }
 
+impl DeviceDriver {
+    /// Name in the file.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::None => "none",
+            Self::Sim => "sim",
+            Self::Replay => "replay",
+            Self::Window => "window",
+        }
+    }
+}
+
 /// `[replay]`
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]

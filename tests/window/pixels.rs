@@ -122,7 +122,7 @@ fn receipts_say_that_they_are_guessed_and_come_no_faster_than_the_display() {
         last = receipt.flipped;
     }
     assert!(last.since(began) >= info.refresh_period * 28, "30 pictures in {:?}", last.since(began));
-    assert_eq!(info.refresh_period, Duration::from_nanos(16_666_666));
+    assert_eq!(info.refresh_period, Duration::from_nanos(16_666_667));
 }
 
 #[test]

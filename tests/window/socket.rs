@@ -48,7 +48,7 @@ fn one_client_at_a_time_has_the_window_and_leaves_black_behind() {
     let _seat = Seat::start(&xvfb, &socket);
     let mut first = try_open(at(&socket)).expect("a window");
     let (slide, screen) = uniform(&xvfb, [10, 20, 30]);
-    first.load(&[slide.clone()]).expect("a slide");
+    first.load(std::slice::from_ref(&slide)).expect("a slide");
     first.show(0).expect("a picture");
     assert!(xvfb.screen() == screen);
 

@@ -4,7 +4,10 @@ use std::{
     io::{self, Read, Write},
     os::{
         fd::AsFd,
-        unix::net::{UnixListener, UnixStream},
+        unix::{
+            fs::PermissionsExt,
+            net::{UnixListener, UnixStream},
+        },
     },
     path::Path,
     sync::Arc,
@@ -82,6 +85,8 @@ pub fn listen(path: &Path, proxy: EventLoopProxy<News>) -> io::Result<()> {
         std::fs::remove_file(path)?;
     }
     let listener = UnixListener::bind(path)?;
+    // The service is another user; it shares the group of the folder.
+    std::fs::set_permissions(path, std::fs::Permissions::from_mode(0o660))?;
     std::thread::Builder::new().name("projector clients".into()).spawn(move || {
         for (id, stream) in (1..).zip(listener.incoming()) {
             let Ok(client) = stream.and_then(|stream| client(id, stream)) else { continue };

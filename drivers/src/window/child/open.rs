@@ -27,6 +27,9 @@ const USUAL_HZ: f64 = 60.0;
 /// Pictures to find out by what flips can be known. The first ones of a window may be copied where later ones flip.
 const PROBES: usize = 4;
 
+/// So many pictures in a row of which nothing was told: nothing will be.
+const SILENT: usize = 2;
+
 /// How long the first pictures are waited for.
 const PROBE: Duration = Duration::from_millis(200);
 
@@ -219,11 +222,15 @@ fn probe(
     findings: &mut Vec<String>,
 ) -> Result<(ReceiptMethod, Evidence), Fault> {
     let pixels = u64::from(place.width) * u64::from(place.height);
-    let mut last = None;
+    let (mut last, mut silent) = (None, 0);
     for _ in 0..PROBES {
         watch.forget()?;
         gpu.present(None)?;
         last = watch.wait(pixels, Instant::now() + PROBE)?;
+        silent = if last.is_none() { silent + 1 } else { 0 };
+        if silent == SILENT {
+            break;
+        }
     }
     if let Some(Seen::Completed { how, .. }) = last {
         let reason = watch.between()?.or_else(|| {
