@@ -37,10 +37,13 @@ fn a_killed_window_is_opened_again_with_the_next_picture() {
     projector.show(0).expect("a picture");
     let first = window_process(&xvfb);
     kill_process(first, Signal::KILL).expect("it runs");
-    // Nobody asked it anything when it died, so nobody needs to hear of it.
-    // A process that has ended and was not waited for is a zombie.
-    let stat = format!("/proc/{}/stat", first.as_raw_nonzero());
-    eventually("it has ended", || fs::read_to_string(&stat).is_ok_and(|stat| stat.contains(") Z ")));
+    // Nobody asked it anything when it died, so nobody needs to hear of it. A process that has ended and was not waited
+    // for is a zombie of one thread.
+    let proc = format!("/proc/{}", first.as_raw_nonzero());
+    eventually("it has ended", || {
+        let stat = fs::read_to_string(format!("{proc}/stat")).expect("its state");
+        stat.contains(") Z ") && fs::read_dir(format!("{proc}/task")).expect("its threads").count() == 1
+    });
     projector.show(0).expect("a picture of a new process");
     assert_ne!(window_process(&xvfb), first);
     assert!(xvfb.screen() == screen);

@@ -12,7 +12,7 @@ use polscan_patterns::{ChannelSet, Mode, Picture, Polarization, ProjectorSize, R
 
 use crate::{
     clock, open, options, try_open, uniform,
-    xvfb::{Xvfb, cover_a_corner},
+    xvfb::{Xvfb, cover_a_corner, manage},
 };
 
 /// Green is horizontal; red and blue are vertical.
@@ -104,11 +104,9 @@ fn receipts_say_that_they_are_guessed_and_come_no_faster_than_the_display() {
     assert_eq!(display.receipts, ReceiptMethod::Guessed);
     assert_eq!(display.format, "Bgra8Unorm");
     assert!(display.adapter.contains("llvmpipe"), "{}", display.adapter);
-    assert!(
-        display.findings.iter().any(|finding| finding.contains("only guessed")),
-        "{:?}",
-        display.findings
-    );
+    let [refresh, guessed] = &display.findings[..] else { panic!("{:?}", display.findings) };
+    assert_eq!(refresh, "screen does not tell its refresh rate; 60 Hz is assumed");
+    assert!(guessed.starts_with("times of flips are only guessed: "), "{guessed}");
     projector.load(&[Slide::Uniform([255; 3]), Slide::Uniform([0, 255, 0])]).expect("slides");
     let began = clock.now();
     let mut last = began;
@@ -175,4 +173,27 @@ fn a_window_that_covers_the_patterns_is_noticed() {
     drop(other);
     crate::xvfb::eventually("the window is gone", || projector.show(0).is_ok());
     assert!(xvfb.screen() == screen);
+}
+
+#[test]
+fn a_window_manager_makes_it_full_screen() {
+    let xvfb = Xvfb::start(320, 240);
+    manage(&xvfb, false);
+    let mut projector = open(&xvfb);
+    let (slide, screen) = uniform(&xvfb, [40, 50, 60]);
+    projector.load(&[slide]).expect("a slide");
+    projector.show(0).expect("a picture");
+    assert!(xvfb.screen() == screen);
+}
+
+#[test]
+fn a_window_manager_that_keeps_it_small_is_refused() {
+    let xvfb = Xvfb::start(320, 240);
+    manage(&xvfb, true);
+    let refused = try_open(options(&xvfb)).map(|_| ()).expect_err("the window is small");
+    let text = "asked a window at 320x240+0+0, has one at 160x120+20+10";
+    assert!(
+        refused.to_string().contains("one pixel per pixel") && refused.to_string().contains(text),
+        "{refused}"
+    );
 }

@@ -8,8 +8,15 @@ use std::{
 
 use x11rb::{
     connection::Connection,
-    protocol::xproto::{ConnectionExt as _, CreateWindowAux, ImageFormat, Window, WindowClass},
+    protocol::{
+        Event,
+        xproto::{
+            AtomEnum, ChangeWindowAttributesAux, ConfigureWindowAux, ConnectionExt as _, CreateWindowAux,
+            EventMask, ImageFormat, PropMode, Window, WindowClass,
+        },
+    },
     rust_connection::RustConnection,
+    wrapper::ConnectionExt as _,
 };
 
 /// An Xvfb of this test, ended with it.
@@ -102,6 +109,55 @@ pub fn cover_a_corner(xvfb: &Xvfb) -> RustConnection {
         .expect("a window");
     x.map_window(id).expect("a request").check().expect("a window");
     x
+}
+
+/// The least of a window manager: it announces itself, places windows where it likes until they ask to be full-screen,
+/// and then gives them the screen. `stubborn` ones do not. Runs until the server ends.
+pub fn manage(xvfb: &Xvfb, stubborn: bool) {
+    let (x, root) = xvfb.connect();
+    let atom =
+        |name: &str| x.intern_atom(false, name.as_bytes()).expect("a request").reply().expect("an atom").atom;
+    let (check, supported) = (atom("_NET_SUPPORTING_WM_CHECK"), atom("_NET_SUPPORTED"));
+    let (state, fullscreen) = (atom("_NET_WM_STATE"), atom("_NET_WM_STATE_FULLSCREEN"));
+    let redirect = ChangeWindowAttributesAux::new()
+        .event_mask(EventMask::SUBSTRUCTURE_REDIRECT | EventMask::SUBSTRUCTURE_NOTIFY);
+    x.change_window_attributes(root, &redirect).expect("a request").check().expect("the only manager");
+    let own = x.generate_id().expect("an id");
+    let hidden = CreateWindowAux::new();
+    x.create_window(24, own, root, -1, -1, 1, 1, 0, WindowClass::INPUT_OUTPUT, 0, &hidden)
+        .expect("a request");
+    for window in [root, own] {
+        x.change_property32(PropMode::REPLACE, window, check, AtomEnum::WINDOW, &[own]).expect("a request");
+    }
+    let can = [check, state, fullscreen];
+    x.change_property32(PropMode::REPLACE, root, supported, AtomEnum::ATOM, &can).expect("a request");
+    let size = x.get_geometry(root).expect("a request").reply().expect("a size");
+    let (width, height) = (size.width.into(), size.height.into());
+    let whole = ConfigureWindowAux::new().x(0).y(0).width(width).height(height);
+    let small = ConfigureWindowAux::new().x(20).y(10).width(width / 2).height(height / 2);
+    std::thread::spawn(move || {
+        while let Ok(event) = x.wait_for_event() {
+            let done = match event {
+                Event::MapRequest(event) => {
+                    let asked = x.get_property(false, event.window, state, AtomEnum::ATOM, 0, 8);
+                    let asked = asked.expect("a request").reply().expect("a property");
+                    let full =
+                        asked.value32().is_some_and(|mut states| states.any(|asked| asked == fullscreen));
+                    let place = if full && !stubborn { &whole } else { &small };
+                    x.configure_window(event.window, place)
+                        .and_then(|_| x.map_window(event.window))
+                        .map(|_| ())
+                }
+                Event::ClientMessage(event) if event.type_ == state && !stubborn => {
+                    x.configure_window(event.window, &whole).map(|_| ())
+                }
+                _ => Ok(()),
+            };
+            if done.and_then(|()| x.flush()).is_err() {
+                return;
+            }
+        }
+    });
 }
 
 /// Waits until `what` holds.

@@ -180,7 +180,7 @@ pub(super) fn written(place: Place) -> String {
 
 /// Finds the display and makes a window that covers it.
 fn start(event_loop: &ActiveEventLoop, client: &Client, want: Want) -> Result<Opening, Fault> {
-    let mut watch = Watch::new()?;
+    let mut watch = Watch::new(None)?;
     let (display, place) = watch.choose(&want)?;
     let managed = watch.has_manager()?;
     let mut attributes = Window::default_attributes()

@@ -147,25 +147,12 @@ impl Open {
 
     /// The evidence of the picture that was just handed over; `None` where the display skipped it.
     fn receipt(&mut self, slide: Option<u32>) -> Result<Option<Shown>, Fault> {
-        let guessed =
-            |refresh| Shown { slide, flipped_ns: monotonic_ns(), refresh, method: ReceiptMethod::Guessed };
-        if self.evidence == Evidence::Return {
-            return Ok(Some(guessed(None)));
-        }
-        let pixels = u64::from(self.place.width) * u64::from(self.place.height);
-        match self.watch.wait(pixels, Instant::now() + SHOW)? {
-            None => Err(Fault::Timeout(SHOW.as_millis() as u64)),
-            Some(Seen::Drawn) => Ok(Some(guessed(None))),
-            Some(Seen::Completed { how: How::Skip, .. }) => Ok(None),
-            Some(Seen::Completed { msc, ust, how }) => {
-                let (flipped_ns, now) = (ust.saturating_mul(1000), monotonic_ns());
-                let is_ours = u128::from(now.abs_diff(flipped_ns)) < CLOCK_SLACK.as_nanos();
-                let proven = self.hello.method == ReceiptMethod::X11Present && how == How::Flip && is_ours;
-                let method = ReceiptMethod::X11Present;
-                let flip = Shown { slide, flipped_ns, refresh: Some(msc), method };
-                Ok(Some(if proven { flip } else { guessed(None) }))
-            }
-        }
+        let seen = match self.evidence {
+            Evidence::Return => Some(Seen::Drawn),
+            _ => self.watch.wait(self.place.pixels(), Instant::now() + SHOW)?,
+        };
+        let seen = seen.ok_or(Fault::Timeout(SHOW.as_millis() as u64))?;
+        Ok(shown(slide, seen, self.hello.method, monotonic_ns()))
     }
 
     /// Looks whether the window still covers its display, where there is doubt.
@@ -214,6 +201,22 @@ impl Open {
     }
 }
 
+/// The receipt of a picture of which this was seen; `None` where it was skipped. Only a flip at a believable time is
+/// proof, and only on a display that flips reach without a detour.
+fn shown(slide: Option<u32>, seen: Seen, method: ReceiptMethod, now_ns: u64) -> Option<Shown> {
+    let guessed = Shown { slide, flipped_ns: now_ns, refresh: None, method: ReceiptMethod::Guessed };
+    let Seen::Completed { msc, ust, how } = seen else { return Some(guessed) };
+    let flipped_ns = ust.saturating_mul(1000);
+    let is_ours = u128::from(now_ns.abs_diff(flipped_ns)) < CLOCK_SLACK.as_nanos();
+    match how {
+        How::Skip => None,
+        How::Flip if method == ReceiptMethod::X11Present && is_ours => {
+            Some(Shown { slide, flipped_ns, refresh: Some(msc), method })
+        }
+        _ => Some(guessed),
+    }
+}
+
 /// Shows black a few times and sees what the server tells of it.
 fn probe(
     gpu: &mut Gpu,
@@ -221,39 +224,43 @@ fn probe(
     place: Place,
     findings: &mut Vec<String>,
 ) -> Result<(ReceiptMethod, Evidence), Fault> {
-    let pixels = u64::from(place.width) * u64::from(place.height);
     let (mut last, mut silent) = (None, 0);
     for _ in 0..PROBES {
         watch.forget()?;
         gpu.present(None)?;
-        last = watch.wait(pixels, Instant::now() + PROBE)?;
+        last = watch.wait(place.pixels(), Instant::now() + PROBE)?;
         silent = if last.is_none() { silent + 1 } else { 0 };
         if silent == SILENT {
             break;
         }
     }
-    if let Some(Seen::Completed { how, .. }) = last {
-        let reason = watch.between()?.or_else(|| {
-            (how != How::Flip).then(|| "the X server copies pictures instead of switching to them".to_owned())
-        });
-        return Ok(match reason {
-            None => (ReceiptMethod::X11Present, Evidence::Completion),
-            Some(reason) => {
-                findings.push(format!("times of flips are only guessed: {reason}"));
-                (ReceiptMethod::Guessed, Evidence::Completion)
-            }
-        });
+    let doubt = doubt(last, watch.between()?);
+    if let Some(reason) = &doubt {
+        findings.push(format!("times of flips are only guessed: {reason}"));
     }
-    findings.push(
-        "times of flips are only guessed: the X server tells none, as one without a display does".into(),
-    );
+    if last.is_some() {
+        let method = if doubt.is_none() { ReceiptMethod::X11Present } else { ReceiptMethod::Guessed };
+        return Ok((method, Evidence::Completion));
+    }
     if watch.watch_drawing()? {
         gpu.present(None)?;
-        if watch.wait(pixels, Instant::now() + SHOW)?.is_some() {
+        if watch.wait(place.pixels(), Instant::now() + SHOW)?.is_some() {
             return Ok((ReceiptMethod::Guessed, Evidence::Drawing));
         }
     }
     Ok((ReceiptMethod::Guessed, Evidence::Return))
+}
+
+/// Why flips cannot be known by what was `seen` of pictures, with what stands `between` server and glass; `None` where
+/// they can.
+fn doubt(seen: Option<Seen>, between: Option<String>) -> Option<String> {
+    between.or_else(|| match seen {
+        Some(Seen::Completed { how: How::Flip, .. }) => None,
+        Some(Seen::Completed { .. }) => {
+            Some("the X server copies pictures instead of switching to them".into())
+        }
+        _ => Some("the X server tells none, as one without a display does".into()),
+    })
 }
 
 fn hello(
@@ -287,6 +294,37 @@ fn monotonic_ns() -> u64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    fn completed(how: How, ust: u64) -> Seen {
+        Seen::Completed { msc: 77, ust, how }
+    }
+
+    #[test]
+    fn only_a_flip_at_a_believable_time_is_proof() {
+        use ReceiptMethod::{Guessed, X11Present};
+        let now_ns = 50_000_000_000;
+        let receipt = |seen, method| shown(Some(3), seen, method, now_ns);
+        let guess = Shown { slide: Some(3), flipped_ns: now_ns, refresh: None, method: Guessed };
+        let proof = Shown { flipped_ns: 49_999_000_000, refresh: Some(77), method: X11Present, ..guess };
+        let flip = completed(How::Flip, 49_999_000);
+        assert_eq!(receipt(flip, X11Present), Some(proof));
+        // A compositor in between makes even flips a guess; so does a time of another clock.
+        assert_eq!(receipt(flip, Guessed), Some(guess));
+        assert_eq!(receipt(completed(How::Flip, 40_000_000), X11Present), Some(guess));
+        assert_eq!(receipt(completed(How::Flip, u64::MAX), X11Present), Some(guess));
+        assert_eq!(receipt(completed(How::Copy, 49_999_000), X11Present), Some(guess));
+        assert_eq!(receipt(Seen::Drawn, Guessed), Some(guess));
+        assert_eq!(receipt(completed(How::Skip, 49_999_000), X11Present), None);
+    }
+
+    #[test]
+    fn what_makes_flips_a_guess_is_named() {
+        let flip = Some(completed(How::Flip, 1));
+        assert_eq!(doubt(flip, None), None);
+        assert_eq!(doubt(flip, Some("a compositor".into())), Some("a compositor".into()));
+        assert!(doubt(Some(completed(How::Copy, 1)), None).is_some_and(|reason| reason.contains("copies")));
+        assert!(doubt(None, None).is_some_and(|reason| reason.contains("tells none")));
+    }
 
     #[test]
     fn the_own_clock_keeps_its_phase_however_late_one_comes() {

@@ -69,9 +69,9 @@ pub struct Watch {
 }
 
 impl Watch {
-    /// Connects; there is no window yet.
-    pub fn new() -> Result<Self, Fault> {
-        let (x, screen, root) = displays::connect(None)?;
+    /// Connects to the X server that `name` or DISPLAY names; there is no window yet.
+    pub fn new(name: Option<&str>) -> Result<Self, Fault> {
+        let (x, screen, root) = displays::connect(name)?;
         let mask = NotifyMask::SCREEN_CHANGE | NotifyMask::CRTC_CHANGE | NotifyMask::OUTPUT_CHANGE;
         x.randr_select_input(root, mask).map_err(|error| gone(&error))?;
         Ok(Self { x, screen, root, window: None, damage: None, drawn: 0, obscured: false, changed: false })
@@ -222,4 +222,130 @@ impl Watch {
 
 fn gone(error: &dyn std::fmt::Display) -> Fault {
     Fault::Unavailable(format!("the X server is gone ({error}); start it again"))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::{
+        io::{BufRead, BufReader},
+        process::{Child, Command, Stdio},
+    };
+
+    use rustix::time::{ClockId, clock_gettime};
+    use x11rb::protocol::xproto::{CreateGCAux, CreateWindowAux, ImageFormat, WindowClass};
+
+    use super::*;
+
+    const WIDTH: u16 = 64;
+    const HEIGHT: u16 = 48;
+
+    /// An X server whose screen is as large as the window of these tests.
+    struct Server(Child, String);
+
+    impl Server {
+        fn start() -> Self {
+            let size = format!("{WIDTH}x{HEIGHT}x24");
+            let mut server = Command::new("Xvfb");
+            server.args(["-displayfd", "1", "-nolisten", "tcp", "-screen", "0", &size]);
+            let mut server = server.stdout(Stdio::piped()).stderr(Stdio::null()).spawn().expect("Xvfb");
+            let mut number = String::new();
+            let said = server.stdout.take().expect("its output");
+            BufReader::new(said).read_line(&mut number).expect("its number");
+            Self(server, format!(":{}", number.trim()))
+        }
+    }
+
+    impl Drop for Server {
+        fn drop(&mut self) {
+            let _ = self.0.kill();
+            let _ = self.0.wait();
+        }
+    }
+
+    /// Another client's window, as the GPU's driver is another client.
+    fn window(name: &str) -> (RustConnection, Window) {
+        let (x, screen) = RustConnection::connect(Some(name)).expect("a server");
+        let (root, id) = (x.setup().roots[screen].root, x.generate_id().expect("an id"));
+        let attributes = CreateWindowAux::new().override_redirect(1);
+        x.create_window(24, id, root, 0, 0, WIDTH, HEIGHT, 0, WindowClass::INPUT_OUTPUT, 0, &attributes)
+            .and_then(|_| x.map_window(id))
+            .expect("requests")
+            .check()
+            .expect("a window");
+        (x, id)
+    }
+
+    const PIXELS: u64 = WIDTH as u64 * HEIGHT as u64;
+
+    fn soon() -> Instant {
+        Instant::now() + Duration::from_secs(2)
+    }
+
+    #[test]
+    fn completions_of_another_client_are_seen_on_the_machines_clock() {
+        let server = Server::start();
+        let (x, id) = window(&server.1);
+        let mut watch = Watch::new(Some(&server.1)).expect("a server");
+        watch.follow(id).expect("a window");
+        let place = Place { x: 0, y: 0, width: WIDTH.into(), height: HEIGHT.into() };
+        assert_eq!(watch.place(id), Ok(Some(place)));
+        let pixmap = x.generate_id().expect("an id");
+        x.create_pixmap(24, pixmap, id, WIDTH, HEIGHT).expect("a request").check().expect("a pixmap");
+        x.present_query_version(1, 2).expect("a request").reply().expect("the extension");
+        let mut last = 0;
+        for serial in 1..6 {
+            watch.forget().expect("a server");
+            x.present_pixmap(id, pixmap, serial, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, &[])
+                .expect("a request")
+                .check()
+                .expect("a picture");
+            let seen = watch.wait(PIXELS, soon()).expect("a server");
+            let Some(Seen::Completed { msc, ust, how }) = seen else { panic!("{seen:?}") };
+            // A server without a display cannot switch to a picture.
+            assert_eq!(how, How::Copy);
+            assert!(msc > last, "refresh {msc} after {last}");
+            last = msc;
+            let now = clock_gettime(ClockId::Monotonic);
+            let now_us = now.tv_sec as u64 * 1_000_000 + now.tv_nsec as u64 / 1000;
+            assert!(now_us.abs_diff(ust) < 1_000_000, "{ust} us at {now_us} us");
+        }
+    }
+
+    #[test]
+    fn a_picture_is_drawn_when_all_of_it_is() {
+        let server = Server::start();
+        let (x, id) = window(&server.1);
+        let mut watch = Watch::new(Some(&server.1)).expect("a server");
+        watch.follow(id).expect("a window");
+        assert_eq!(watch.watch_drawing(), Ok(true));
+        let gc = x.generate_id().expect("an id");
+        x.create_gc(gc, id, &CreateGCAux::new()).expect("a request").check().expect("a context");
+        let rows = |from: u16, rows: u16| {
+            let bytes = vec![7; 4 * usize::from(WIDTH) * usize::from(rows)];
+            x.put_image(ImageFormat::Z_PIXMAP, id, gc, WIDTH, rows, 0, from as i16, 0, 24, &bytes)
+                .expect("a request")
+                .check()
+                .expect("drawn");
+        };
+        watch.forget().expect("a server");
+        rows(0, 20);
+        assert_eq!(watch.wait(PIXELS, Instant::now() + Duration::from_millis(100)), Ok(None));
+        rows(20, HEIGHT - 20);
+        assert_eq!(watch.wait(PIXELS, soon()), Ok(Some(Seen::Drawn)));
+        watch.forget().expect("a server");
+        assert_eq!(watch.wait(PIXELS, Instant::now() + Duration::from_millis(50)), Ok(None));
+    }
+
+    #[test]
+    fn a_server_that_goes_away_is_noticed() {
+        let mut server = Server::start();
+        let mut watch = Watch::new(Some(&server.1)).expect("a server");
+        assert_eq!(watch.has_manager(), Ok(false));
+        assert_eq!(watch.between(), Ok(None));
+        watch.stay_awake().expect("a server");
+        server.0.kill().expect("it runs");
+        server.0.wait().expect("it has ended");
+        let gone = watch.wait(PIXELS, soon()).expect_err("it has ended");
+        assert!(matches!(&gone, Fault::Unavailable(said) if said.contains("X server is gone")), "{gone:?}");
+    }
 }
