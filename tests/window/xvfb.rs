@@ -27,7 +27,7 @@ pub struct Xvfb {
 }
 
 impl Xvfb {
-    /// Starts one on a display that nobody has.
+    /// Starts one on a display that nobody has. It outlives its clients, as one with a session does.
     pub fn start(width: u32, height: u32) -> Self {
         Self::launch(None, width, height)
     }
@@ -39,7 +39,7 @@ impl Xvfb {
 
     fn launch(number: Option<u32>, width: u32, height: u32) -> Self {
         let mut command = Command::new("Xvfb");
-        command.args(number.map(|number| format!(":{number}")));
+        command.args(number.map(|number| format!(":{number}"))).arg("-noreset");
         command.args([
             "-displayfd",
             "1",
@@ -132,7 +132,7 @@ pub fn manage(xvfb: &Xvfb, stubborn: bool) {
     let can = [check, state, fullscreen];
     x.change_property32(PropMode::REPLACE, root, supported, AtomEnum::ATOM, &can).expect("a request");
     let size = x.get_geometry(root).expect("a request").reply().expect("a size");
-    let (width, height) = (size.width.into(), size.height.into());
+    let (width, height) = (u32::from(size.width), u32::from(size.height));
     let whole = ConfigureWindowAux::new().x(0).y(0).width(width).height(height);
     let small = ConfigureWindowAux::new().x(20).y(10).width(width / 2).height(height / 2);
     std::thread::spawn(move || {

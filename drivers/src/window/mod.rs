@@ -25,6 +25,7 @@ mod edid;
 mod process;
 pub mod protocol;
 mod supervise;
+mod wire;
 
 pub use child::{ChildError, run};
 

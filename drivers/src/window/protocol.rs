@@ -6,8 +6,8 @@
 
 use std::sync::Arc;
 
-use thiserror::Error;
-
+pub use super::wire::BadMessage;
+use super::wire::{Reader, Writer};
 use crate::projector::{ReceiptMethod, Rgb, Slide};
 
 /// Version of the messages.
@@ -176,26 +176,6 @@ impl Asked {
     }
 }
 
-/// Why bytes are no message.
-#[derive(Debug, Clone, PartialEq, Eq, Error)]
-pub enum BadMessage {
-    /// It is longer than any message.
-    #[error("a message of {0} bytes is longer than any is")]
-    TooLong(usize),
-    /// It ends too early.
-    #[error("a message of kind {0} ends too early")]
-    Short(u8),
-    /// It goes on after its last field.
-    #[error("a message of kind {0} goes on after its end")]
-    Long(u8),
-    /// Nobody says that.
-    #[error("no message has the kind {0}")]
-    Kind(u8),
-    /// A field has a value that it cannot have.
-    #[error("a message of kind {0} has a field with an impossible value")]
-    Value(u8),
-}
-
 /// Length and kind of the message that begins with `header`: bytes of its fields, and what it is.
 pub fn parse_header(header: [u8; HEADER]) -> Result<(usize, u8), BadMessage> {
     let [a, b, c, d, kind] = header;
@@ -356,143 +336,12 @@ fn decode_slide(fields: &mut Reader<'_>) -> Result<Slide, BadMessage> {
     }
 }
 
-/// Ways of knowing a flip, by their number in a message.
-const METHODS: [ReceiptMethod; 5] = [
-    ReceiptMethod::Simulated,
-    ReceiptMethod::X11Present,
-    ReceiptMethod::WaylandPresentation,
-    ReceiptMethod::Guessed,
-    ReceiptMethod::Recorded,
-];
-
-struct Writer {
-    bytes: Vec<u8>,
-}
-
-impl Writer {
-    fn new(kind: u8) -> Self {
-        Self { bytes: vec![0, 0, 0, 0, kind] }
-    }
-
-    fn u8(mut self, value: u8) -> Self {
-        self.bytes.push(value);
-        self
-    }
-
-    fn u16(mut self, value: u16) -> Self {
-        self.bytes.extend(value.to_le_bytes());
-        self
-    }
-
-    fn u32(mut self, value: u32) -> Self {
-        self.bytes.extend(value.to_le_bytes());
-        self
-    }
-
-    fn u64(mut self, value: u64) -> Self {
-        self.bytes.extend(value.to_le_bytes());
-        self
-    }
-
-    fn text(mut self, text: &str) -> Self {
-        self = self.u32(text.len() as u32);
-        self.bytes.extend(text.as_bytes());
-        self
-    }
-
-    fn method(self, method: ReceiptMethod) -> Self {
-        self.u8(METHODS.iter().position(|known| *known == method).unwrap_or_default() as u8)
-    }
-
-    fn option<T>(self, value: Option<T>, write: impl FnOnce(Self, T) -> Self) -> Self {
-        match value {
-            None => self.u8(0),
-            Some(value) => write(self.u8(1), value),
-        }
-    }
-
-    fn list<T>(self, values: &[T], write: impl Fn(Self, &T) -> Self) -> Self {
-        values.iter().fold(self.u32(values.len() as u32), write)
-    }
-
-    /// The whole message, with its length before it.
-    fn done(mut self) -> Vec<u8> {
-        let length = (self.bytes.len() - HEADER) as u32;
-        self.bytes[..4].copy_from_slice(&length.to_le_bytes());
-        self.bytes
-    }
-}
-
-struct Reader<'a> {
-    kind: u8,
-    rest: &'a [u8],
-}
-
-impl Reader<'_> {
-    fn array<const N: usize>(&mut self) -> Result<[u8; N], BadMessage> {
-        let (value, rest) = self.rest.split_first_chunk().ok_or(BadMessage::Short(self.kind))?;
-        self.rest = rest;
-        Ok(*value)
-    }
-
-    fn u8(&mut self) -> Result<u8, BadMessage> {
-        Ok(u8::from_le_bytes(self.array()?))
-    }
-
-    fn u16(&mut self) -> Result<u16, BadMessage> {
-        Ok(u16::from_le_bytes(self.array()?))
-    }
-
-    fn u32(&mut self) -> Result<u32, BadMessage> {
-        Ok(u32::from_le_bytes(self.array()?))
-    }
-
-    fn u64(&mut self) -> Result<u64, BadMessage> {
-        Ok(u64::from_le_bytes(self.array()?))
-    }
-
-    fn text(&mut self) -> Result<String, BadMessage> {
-        let length = self.u32()? as usize;
-        let (text, rest) = self.rest.split_at_checked(length).ok_or(BadMessage::Short(self.kind))?;
-        self.rest = rest;
-        String::from_utf8(text.to_vec()).map_err(|_| BadMessage::Value(self.kind))
-    }
-
-    fn method(&mut self) -> Result<ReceiptMethod, BadMessage> {
-        METHODS.get(usize::from(self.u8()?)).copied().ok_or(BadMessage::Value(self.kind))
-    }
-
-    fn option<T>(
-        &mut self,
-        read: impl FnOnce(&mut Self) -> Result<T, BadMessage>,
-    ) -> Result<Option<T>, BadMessage> {
-        match self.u8()? {
-            0 => Ok(None),
-            1 => read(self).map(Some),
-            _ => Err(BadMessage::Value(self.kind)),
-        }
-    }
-
-    /// As many values as the message says. A number without the values after it takes no memory.
-    fn list<T>(&mut self, read: impl Fn(&mut Self) -> Result<T, BadMessage>) -> Result<Vec<T>, BadMessage> {
-        let count = self.u32()?;
-        let mut values = Vec::new();
-        for _ in 0..count {
-            values.push(read(self)?);
-        }
-        Ok(values)
-    }
-
-    fn end<T>(self, message: T) -> Result<T, BadMessage> {
-        if self.rest.is_empty() { Ok(message) } else { Err(BadMessage::Long(self.kind)) }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use proptest::{collection::vec, option, prelude::*};
 
     use super::*;
+    use crate::window::wire::METHODS;
 
     fn slide() -> impl Strategy<Value = Slide> {
         let values = || vec(any::<Rgb>(), 0..50).prop_map(Arc::from);
