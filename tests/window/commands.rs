@@ -91,6 +91,18 @@ fn displays_are_listed_with_their_modes() {
 }
 
 #[test]
+fn where_no_display_can_be_looked_for_that_is_what_is_listed() {
+    let mut xvfb = Xvfb::start(320, 240);
+    let mut command = program(&xvfb, &["devices"]);
+    xvfb.kill();
+    let output = command.output().expect("the program");
+    let text = String::from_utf8_lossy(&output.stdout);
+    assert_eq!(output.status.code(), Some(0), "{text}");
+    let wanted = format!("no connection to the X server at `{}`", xvfb.display());
+    assert!(text.contains("(driver window)") && text.contains(&wanted), "{text}");
+}
+
+#[test]
 fn nobody_but_the_service_starts_the_window() {
     let mut command = Command::new(PROGRAM);
     command.arg("projector").stdin(Stdio::null());

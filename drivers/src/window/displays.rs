@@ -226,6 +226,11 @@ fn code_values(x: &RustConnection, display: &mut Display, output: Output, crtc: 
         let next = format!("`xrandr --output {} --gamma 1:1:1 --brightness 1`", display.connector);
         display.findings.push(format!("a gamma table or night light bends code values; undo it with {next}"));
     }
+    if is_mixed(&property(x, output, "CTM")?) {
+        display
+            .findings
+            .push(format!("a colour matrix (CTM) of {} mixes channels; reset it", display.connector));
+    }
     let range = property(x, output, "Broadcast RGB")?;
     if let Some(atom) = range.first_chunk::<4>().map(|bytes| u32::from_ne_bytes(*bytes))
         && atom != 0
@@ -246,6 +251,18 @@ fn is_linear(ramp: &[u16]) -> bool {
     let last = ramp.len().saturating_sub(1).max(1) as f64;
     let wanted = (0..ramp.len()).map(|at| 65_535.0 * at as f64 / last);
     ramp.iter().zip(wanted).all(|(has, wanted)| (f64::from(*has) - wanted).abs() <= 128.0)
+}
+
+/// Whether a colour matrix is any but the identity: nine numbers with 32 bits after the point, low word first, each word
+/// of the width that the server keeps it in. One of zeros was never set.
+fn is_mixed(matrix: &[u8]) -> bool {
+    let (words, _) = matrix.as_chunks::<4>();
+    let numbers: Vec<u64> = words
+        .chunks_exact(2)
+        .map(|pair| u64::from(u32::from_ne_bytes(pair[1])) << 32 | u64::from(u32::from_ne_bytes(pair[0])))
+        .collect();
+    const ONE: u64 = 1 << 32;
+    numbers.iter().any(|number| *number != 0) && numbers != [ONE, 0, 0, 0, ONE, 0, 0, 0, ONE]
 }
 
 /// Bytes of an output's property; empty where it has none of that name.
@@ -367,6 +384,21 @@ mod tests {
         assert!((refresh_hz(&mode).expect("a rate") - 2.0 * hz).abs() < 1e-9);
         mode.dot_clock = 0;
         assert_eq!(refresh_hz(&mode), None);
+    }
+
+    #[test]
+    fn only_a_colour_matrix_that_does_something_is_one() {
+        let bytes = |numbers: [u64; 9]| -> Vec<u8> {
+            numbers.iter().flat_map(|n| [*n as u32, (*n >> 32) as u32]).flat_map(u32::to_ne_bytes).collect()
+        };
+        let mut numbers = [0; 9];
+        assert!(!is_mixed(&[]) && !is_mixed(&bytes(numbers)));
+        for at in [0, 4, 8] {
+            numbers[at] = 1 << 32;
+        }
+        assert!(!is_mixed(&bytes(numbers)));
+        numbers[8] = 3 << 30;
+        assert!(is_mixed(&bytes(numbers)), "less blue, as night light makes it");
     }
 
     #[test]
