@@ -55,6 +55,14 @@ enum Command {
     Openapi,
     /// List cameras and projectors, usable or not.
     Devices(ConfigArgs),
+    /// Hold one picture on the projector for set-up, until an interrupt.
+    Show(Show),
+    /// Own the projector's full-screen window: for the service, which starts this by itself where it can.
+    Projector {
+        /// Socket to serve at, for a service that cannot reach the X server itself (its `projector.socket`).
+        #[arg(long, value_name = "SOCKET")]
+        listen: Option<PathBuf>,
+    },
     /// Report every fault of a configuration.
     CheckConfig {
         /// Configuration file.
@@ -67,6 +75,14 @@ struct ConfigArgs {
     /// Configuration file; what it leaves out is as in config/default.toml.
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
+}
+
+#[derive(Debug, Args)]
+struct Show {
+    #[command(flatten)]
+    config: ConfigArgs,
+    /// white, h, v, black, focus, crosshair, checker, or a pattern such as column-0 or row-3-inverse.
+    picture: String,
 }
 
 #[derive(Debug, Args)]
@@ -315,6 +331,12 @@ fn dispatch(cli: &Cli) -> Result<u8, Failure> {
         }
         Command::Openapi => Ok(commands::openapi()),
         Command::Devices(args) => commands::devices(&layers(args, Vec::new()).load()?, cli.json),
+        Command::Show(args) => {
+            let shown =
+                args.picture.parse().map_err(|error: String| Failure::data("choose a picture", error))?;
+            commands::show(&layers(&args.config, Vec::new()).load()?, shown, &args.picture, cli.json)
+        }
+        Command::Projector { listen } => commands::projector(listen.as_deref()),
         Command::CheckConfig { file } => {
             let args = ConfigArgs { config: Some(file.clone()) };
             let settings = layers(&args, Vec::new()).load()?;

@@ -11,3 +11,4 @@ pub mod frame;
 pub mod projector;
 pub mod replay;
 pub mod sim;
+pub mod window;

@@ -70,6 +70,22 @@ pub struct ProjectorInfo {
     pub refresh_period: Duration,
     /// From flip to first light, and until the picture has settled, where it has been measured or is known.
     pub timing: Option<ProjectorTiming>,
+    /// What is known of the way to a real display.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub display: Option<DisplayState>,
+}
+
+/// The way of a picture to a real display.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct DisplayState {
+    /// GPU and its driver.
+    pub adapter: String,
+    /// Format of the surface.
+    pub format: String,
+    /// By what flips are known.
+    pub receipts: ReceiptMethod,
+    /// What a person should know: why flips are only guessed, what bends code values.
+    pub findings: Vec<String>,
 }
 
 /// Durations in files: milliseconds as a number.

@@ -21,8 +21,9 @@ use super::{
 };
 use crate::{
     app,
+    engine::Shown,
     geometry::{Calibration, ReadHints},
-    scanner::{Obstacle, RigState, Shown, Snapshot, StorageStatus},
+    scanner::{Obstacle, RigState, Snapshot, StorageStatus},
     store::source::read_calibration,
 };
 

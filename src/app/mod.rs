@@ -15,9 +15,11 @@ use thiserror::Error;
 mod held;
 mod replay;
 mod twin;
+mod window;
 
 pub use held::holding;
 pub use twin::without_analyser;
+pub use window::{WindowError, serve_projector};
 
 use crate::{
     config::{DeviceDriver, Settings, UsbMode},
@@ -70,14 +72,12 @@ impl Rig {
     /// Opens what the settings ask for.
     pub fn open(settings: &Settings) -> Result<Self, RigError> {
         let Families { cameras, projectors, clock, knows } = families(settings)?;
-        let (camera, projector) = (&settings.raw.camera, &settings.raw.projector);
         let cameras = cameras.ok_or(RigError::NotConfigured("camera"))?;
         let projectors = projectors.ok_or(RigError::NotConfigured("projector"))?;
-        let some = |serial: &str| (!serial.is_empty()).then(|| serial.to_string());
         Ok(Self {
             clock,
-            camera: cameras.open(some(&camera.serial).as_deref())?,
-            projector: projectors.open(some(&projector.serial).as_deref())?,
+            camera: cameras.open(named(&settings.raw.camera.serial))?,
+            projector: projectors.open(named(&settings.raw.projector.serial))?,
             knows,
         })
     }
@@ -101,11 +101,43 @@ impl Rig {
     }
 }
 
-/// All cameras and all projectors that the configured drivers find.
+/// A projector without a camera, for pictures that no camera needs to see.
+pub struct Beam {
+    /// Projector.
+    pub projector: Box<dyn Projector>,
+    /// Clock of its receipts.
+    pub clock: Arc<dyn Clock>,
+}
+
+impl Beam {
+    /// Opens the projector that the settings ask for.
+    pub fn open(settings: &Settings) -> Result<Self, RigError> {
+        let Families { projectors, clock, .. } = families(settings)?;
+        let projectors = projectors.ok_or(RigError::NotConfigured("projector"))?;
+        Ok(Self { projector: projectors.open(named(&settings.raw.projector.serial))?, clock })
+    }
+}
+
+/// A serial number of the configuration, where an empty one stands for the only device there is.
+fn named(serial: &str) -> Option<&str> {
+    (!serial.is_empty()).then_some(serial)
+}
+
+/// All cameras and all projectors that the configured drivers find. Where a driver cannot look, that is what is listed.
 pub fn list(settings: &Settings) -> Result<(Vec<Listing>, Vec<Listing>), RigError> {
     let Families { cameras, projectors, .. } = families(settings)?;
-    let cameras = cameras.map_or(Ok(Vec::new()), |driver| driver.list())?;
-    Ok((cameras, projectors.map_or(Ok(Vec::new()), |driver| driver.list())?))
+    let blind = |driver: DeviceDriver, model: &str, error: DeviceError| Listing {
+        driver: driver.name().to_owned(),
+        model: model.to_owned(),
+        serial: String::new(),
+        unusable: Some(error.to_string()),
+    };
+    let cameras = cameras.map_or(Ok(Vec::new()), |driver| driver.list());
+    let projectors = projectors.map_or(Ok(Vec::new()), |driver| driver.list());
+    Ok((
+        cameras.unwrap_or_else(|error| vec![blind(settings.raw.camera.driver, "any camera", error)]),
+        projectors.unwrap_or_else(|error| vec![blind(settings.raw.projector.driver, "any projector", error)]),
+    ))
 }
 
 /// The configured drivers; `None` for a device that is not configured.
@@ -141,9 +173,10 @@ fn families(settings: &Settings) -> Result<Families, RigError> {
     let clock: Arc<dyn Clock> = Arc::new(MonotonicClock::start());
     let cameras: Option<Box<dyn CameraDriver>> = match settings.raw.camera.driver {
         DeviceDriver::Aravis => Some(Box::new(AravisCameras::new(aravis_options(settings), clock.clone()))),
-        DeviceDriver::None | DeviceDriver::Sim | DeviceDriver::Replay => None,
+        DeviceDriver::None | DeviceDriver::Sim | DeviceDriver::Replay | DeviceDriver::Window => None,
     };
-    Ok(Families { cameras, projectors: None, clock, knows: Knowledge::Nothing })
+    let projectors = window::projectors(settings, &clock);
+    Ok(Families { cameras, projectors, clock, knows: Knowledge::Nothing })
 }
 
 fn aravis_options(settings: &Settings) -> aravis::Options {
@@ -162,7 +195,7 @@ fn aravis_options(settings: &Settings) -> aravis::Options {
 /// Whether devices that the settings name come and go with plugs.
 pub fn is_real(settings: &Settings) -> bool {
     let drivers = [settings.raw.camera.driver, settings.raw.projector.driver];
-    drivers.contains(&DeviceDriver::Aravis)
+    drivers.iter().any(|driver| matches!(driver, DeviceDriver::Aravis | DeviceDriver::Window))
 }
 
 /// What the drivers stand on, with its version: `(name, version)`.

@@ -13,6 +13,7 @@ mod plan;
 mod progress;
 mod scan;
 mod serve;
+mod show;
 
 use std::{io::Write, path::Path};
 
@@ -29,6 +30,7 @@ pub use patterns::{Size, patterns};
 pub use plan::{PlanArgs, plan};
 pub use scan::scan;
 pub use serve::serve;
+pub use show::{projector, show};
 
 /// Prints a line to stdout. A reader that has gone away is no error of ours.
 fn say(text: impl std::fmt::Display) {

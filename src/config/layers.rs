@@ -352,6 +352,25 @@ mod tests {
     }
 
     #[test]
+    fn a_window_is_a_projector_of_a_whole_size() {
+        let rig = |camera: &str, size: &str| {
+            format!("[camera]\ndriver = \"{camera}\"\n[projector]\ndriver = \"window\"\nsize = {size}")
+        };
+        for size in ["[]", "[1024, 768]"] {
+            assert!(load(&rig("none", size), Vec::new()).is_ok(), "{size}");
+        }
+        for size in ["[1024]", "[0, 768]", "[1024, 768, 3]", "[9000, 768]"] {
+            assert_eq!(load(&rig("none", size), Vec::new()).unwrap_err(), ["projector.size"], "{size}");
+        }
+        for camera in ["window", "sim"] {
+            let faults = load(&rig(camera, "[]"), Vec::new()).unwrap_err();
+            assert!(faults.contains(&"camera.driver".to_string()), "{camera}: {faults:?}");
+        }
+        let named = variable("POLSCAN_PROJECTOR__X11_DISPLAY", ":7");
+        assert_eq!(load(&rig("none", "[]"), named).unwrap().raw.projector.x11_display, ":7");
+    }
+
+    #[test]
     fn all_faults_are_reported_at_once() {
         let file = r#"
             typo = 1

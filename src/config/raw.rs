@@ -130,6 +130,21 @@ pub enum DeviceDriver {
     Replay,
     /// GenICam cameras by the Aravis library.
     Aravis,
+    /// A full-screen window; projectors only.
+    Window,
+}
+
+impl DeviceDriver {
+    /// Name in the file.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::None => "none",
+            Self::Sim => "sim",
+            Self::Replay => "replay",
+            Self::Aravis => "aravis",
+            Self::Window => "window",
+        }
+    }
 }
 
 /// How USB cameras of the driver `aravis` send.
@@ -216,6 +231,14 @@ pub struct Projector {
     pub hold_refreshes: u32,
     /// Flip to trigger in ms, 0 = as timing demands.
     pub trigger_delay_ms: f64,
+    /// Columns and rows of the display's mode, empty = any.
+    pub size: Vec<u32>,
+    /// Its refreshes per second, 0 = any.
+    pub refresh_hz: f64,
+    /// X server of the window, empty = that of DISPLAY.
+    pub x11_display: String,
+    /// Socket of a projector process that runs already, empty = start one.
+    pub socket: String,
 }
 
 /// `[capture]`

@@ -131,6 +131,7 @@ fn check_ranges(raw: &Raw, faults: &mut Faults) {
     within("camera.gamma", raw.camera.gamma, 0.1, 5.0, "");
     within("projector.hold_refreshes", f64::from(raw.projector.hold_refreshes), 0.0, 600.0, " refreshes");
     within("projector.trigger_delay_ms", raw.projector.trigger_delay_ms, 0.0, 10_000.0, " ms");
+    within("projector.refresh_hz", raw.projector.refresh_hz, 0.0, 1000.0, " Hz");
     within("rig.calibration_unit_mm", raw.rig.calibration_unit_mm, 1e-3, 1e6, " mm");
     within("capture.retakes_per_pair", f64::from(raw.capture.retakes_per_pair), 0.0, 100.0, "");
     within("capture.retakes_per_scan", f64::from(raw.capture.retakes_per_scan), 0.0, 1000.0, "");
@@ -163,6 +164,15 @@ fn check_ranges(raw: &Raw, faults: &mut Faults) {
     }
     if raw.projector.driver == DeviceDriver::Aravis {
         faults.push(("projector.driver".into(), "aravis drives cameras only".into()));
+    }
+    let size = &raw.projector.size;
+    if !(size.is_empty() || size.len() == 2 && size.iter().all(|side| (1..=8192).contains(side))) {
+        let message =
+            format!("{size:?} is no size; give columns and rows of 1 to 8192, as [1024, 768], or []");
+        faults.push(("projector.size".into(), message));
+    }
+    if raw.camera.driver == DeviceDriver::Window {
+        faults.push(("camera.driver".into(), "`window` is the driver of projectors, not of cameras".into()));
     }
     let pair = [raw.camera.driver, raw.projector.driver];
     for (driver, name) in [(DeviceDriver::Sim, "simulated"), (DeviceDriver::Replay, "replaying")] {

@@ -8,9 +8,11 @@ mod recorded;
 mod results;
 mod salvage;
 mod scan;
+mod shown;
 
 pub use failure::{Failure, Kind};
 pub use recorded::{DecodeRequest, Recorded, decode};
 pub use results::{Results, new_id, write, write_unfinished};
 pub use salvage::salvage;
 pub use scan::{Label, Scan, Taken, rig_failure};
+pub use shown::{Shown, hold};

@@ -43,7 +43,6 @@ pub use metrics::Metrics;
 pub use owner::{Change, Denied, Submit};
 pub use preview::{Exposure, Picture, Preview};
 pub use record::{Cause, Progress, Record, Series, is_id};
-pub use rig::Shown;
 pub use service::{Scanner, Threads, start};
 pub use snapshot::{RigState, RigStatus, Snapshot, StorageStatus};
 pub use state::State;

@@ -12,7 +12,7 @@ use std::{
 };
 
 use polscan_drivers::{camera::CameraInfo, error::DeviceError, projector::ProjectorInfo};
-use polscan_patterns::{Mode, Picture, ProjectorSize, Role, Sequence};
+use polscan_patterns::Mode;
 use tokio::sync::oneshot;
 
 use super::{
@@ -21,9 +21,9 @@ use super::{
 use crate::{
     app::Rig,
     config::Settings,
-    engine::{Failure, Label, Scan, Taken, rig_failure},
+    engine::{Failure, Label, Scan, Shown, Taken, hold, rig_failure},
     report::Diagnosis,
-    sequencer::{CancelFlag, Progress, slide},
+    sequencer::{CancelFlag, Progress},
     store::BundleWriter,
 };
 
@@ -39,35 +39,11 @@ const BACKOFF: [Duration; 5] = [
 /// Longest time between two signs of life of an idle rig.
 const TICK: Duration = Duration::from_millis(500);
 
-/// From flip to steady light of a projector that was not measured.
-const UNMEASURED: Duration = Duration::from_millis(100);
-
 /// Test-only, and set by no unit: the label of scans in which the rig hangs for ever, as a driver that never returns does.
 const STALL_VARIABLE: &str = "POLSCAN_TEST_STALL";
 
 /// How long a frame for the preview is waited for, beyond its exposure.
 const PREVIEW_SLACK: Duration = Duration::from_millis(500);
-
-/// A picture to hold for set-up.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Shown {
-    /// One of the pictures made for it.
-    Picture(Picture),
-    /// A pattern of a sequence.
-    Pattern(Role),
-}
-
-impl std::str::FromStr for Shown {
-    type Err = String;
-
-    fn from_str(text: &str) -> Result<Self, Self::Err> {
-        match (text.parse(), text.parse()) {
-            (Ok(picture), _) => Ok(Self::Picture(picture)),
-            (_, Ok(role)) => Ok(Self::Pattern(role)),
-            (Err(error), _) => Err(format!("{error}, nor a pattern such as column-0 or column-0-inverse")),
-        }
-    }
-}
 
 /// A scan to capture.
 #[derive(Debug)]
@@ -390,32 +366,8 @@ impl Open {
     }
 
     fn show(&mut self, shared: &Shared, shown: Shown) -> Result<(), Failure> {
-        let device = |source| Failure::Device { operation: "hold a picture", source };
-        let info = self.rig.projector.info();
-        let size = ProjectorSize { width: info.width, height: info.height };
-        let polarization = shared.settings.polarization;
-        let raster = match shown {
-            Shown::Picture(picture) => picture.raster(size, polarization),
-            Shown::Pattern(role) => {
-                let modes = [shared.settings.mode, Mode::Pse, Mode::Gray];
-                let sequences = modes.into_iter().map(|mode| Sequence::new(mode, size));
-                let able = sequences.filter_map(Result::ok).find(|sequence| sequence.can_show(role));
-                let sequence = able.ok_or_else(|| {
-                    Failure::data(
-                        "hold a picture",
-                        format!("no mode shows {role} on a projector of this size"),
-                    )
-                })?;
-                sequence.raster(role, polarization)
-            }
-        };
-        self.rig.projector.load(&[slide(raster)]).map_err(device)?;
-        let receipt = self.rig.projector.show(0).map_err(device)?;
-        // Whoever asked may look at once.
-        let timing = self.rig.projector.info().timing;
-        let light = timing.map_or(UNMEASURED, |timing| timing.latency + timing.settling);
-        self.rig.clock.sleep_until(receipt.flipped + light);
-        Ok(())
+        let Rig { projector, clock, .. } = &mut self.rig;
+        hold(shown, &shared.settings, projector.as_mut(), clock.as_ref())
     }
 
     fn preview(&mut self, shared: &Shared) -> Result<(), DeviceError> {

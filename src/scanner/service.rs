@@ -15,10 +15,11 @@ use tokio::sync::{oneshot, watch};
 use super::{
     EventLog, Heartbeat, Metrics, Preview, Record, Snapshot, disk, finish,
     owner::{Change, Denied, Message, Outlets, Owner, Submit},
-    rig::{self, Shown},
+    rig,
 };
 use crate::{
     config::Settings,
+    engine::Shown,
     store::{Index, Library},
 };
 

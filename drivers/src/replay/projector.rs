@@ -38,6 +38,7 @@ impl ProjectorDriver for ReplayProjectors {
             refresh_period: recording.refresh_period,
             // A recording answers at once and completely.
             timing: Some(ProjectorTiming { latency: Duration::ZERO, settling: Duration::ZERO }),
+            display: None,
         };
         Ok(Box::new(ReplayProjector { shared: self.shared.clone(), info, loaded: None }))
     }

@@ -70,6 +70,7 @@ impl SimProjector {
             height: projector.size[1],
             refresh_period: Duration::from_nanos(timeline.period_ns()),
             timing,
+            display: None,
         };
         drop(timeline);
         Self { taken, info, slides: None }

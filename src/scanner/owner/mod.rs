@@ -29,13 +29,13 @@ use super::{
     heartbeat::Heartbeat,
     metrics::Metrics,
     record::{Record, Series},
-    rig::{self, Captured, Shown},
+    rig::{self, Captured},
     snapshot::{RigState, RigStatus, Snapshot, StorageStatus},
     state::State,
 };
 use crate::{
     config::Settings,
-    engine::{Failure, Label},
+    engine::{Failure, Label, Shown},
     report::{Diagnosis, Report, Verdict},
     sequencer::CancelFlag,
     store::{

@@ -456,6 +456,7 @@ fn rig_on(clock: Arc<dyn Clock>, faults: &[Fault]) -> (Arc<World>, Panel, Eye) {
             width: 8,
             height: 4,
             refresh_period: Duration::from_nanos(REFRESH_NS),
+            display: None,
             timing: Some(ProjectorTiming { latency: LATENCY, settling: SETTLING }),
         },
         slides: 0,

@@ -15,6 +15,7 @@ fn timing() -> Timing {
         width: 8,
         height: 8,
         refresh_period: Duration::from_nanos(REFRESH),
+        display: None,
         timing: None,
     };
     Timing::new(&projector, 2000.0, 0.0, &PlanOptions::default()).unwrap()

@@ -18,6 +18,7 @@ fn plan(mode: Mode) -> Plan {
         width: 4,
         height: 2,
         refresh_period: Duration::from_millis(10),
+        display: None,
         timing: Some(ProjectorTiming {
             latency: Duration::from_millis(20),
             settling: Duration::from_millis(10),

@@ -18,6 +18,7 @@ fn projector(period: Duration, timing: Option<(Duration, Duration)>) -> Projecto
         width: 1024,
         height: 768,
         refresh_period: period,
+        display: None,
         timing: timing.map(|(latency, settling)| ProjectorTiming { latency, settling }),
     }
 }
