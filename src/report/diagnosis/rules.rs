@@ -6,7 +6,7 @@ use super::{Diagnosis, Reason, Verdict, captured, dark, order, pairs, polarity, 
 use crate::{
     cloud::RowCheck,
     decode::{Class, Decoded},
-    evidence::Frames,
+    evidence::{Frames, settling},
     report::{
         CaptureSummary, PixelCounts, ReportInput,
         statistics::{self, share},
@@ -79,9 +79,11 @@ fn from_pixels(input: &ReportInput, decoded: &Decoded, pixels: &PixelCounts) -> 
     let mut look = look.map(|settings| Frames::new(input.planes, settings, decoded));
     if let Some(frames) = &mut look {
         frames.adjusts = pairs::is_automatic(*frames);
+        frames.rest = settling::rest_of_all(*frames);
     }
-    // References that were exposed otherwise are no other pictures.
-    let disagree = look.filter(|frames| !frames.adjusts).and_then(references::disagree);
+    // References that were exposed otherwise, or carry rests of others, are no other pictures.
+    let disagree =
+        look.filter(|frames| !frames.adjusts && frames.rest.is_none()).and_then(references::disagree);
     if let (Some(frames), true) = (&mut look, disagree.is_some()) {
         frames.last_references = false;
     }
