@@ -90,8 +90,12 @@ fn from_pixels(input: &ReportInput, decoded: &Decoded, pixels: &PixelCounts) -> 
     let mut reasons = pairs::diagnose(decoded, look);
     if let Some(disagree) = disagree {
         // A drift between references that show different pictures is none.
-        reasons
-            .retain(|reason| !matches!(reason.diagnosis, Diagnosis::ExposureDrift | Diagnosis::AmbientDrift));
+        let repeated = look.is_some_and(references::is_repeated);
+        reasons.retain(|reason| match reason.diagnosis {
+            Diagnosis::ExposureDrift | Diagnosis::AmbientDrift => false,
+            Diagnosis::Motion => !repeated,
+            _ => true,
+        });
         // Behind a lost frame the references are out of place as well.
         if !reasons.iter().any(|reason| reason.diagnosis == Diagnosis::LostFrame) {
             reasons.push(disagree);
@@ -109,7 +113,17 @@ fn from_pixels(input: &ReportInput, decoded: &Decoded, pixels: &PixelCounts) -> 
     // A wrong frame puts edges in wrong places, too: that would be said twice.
     let wrong = reasons.iter().any(is_wrong);
     if !wrong || !reasons.iter().any(|reason| reason.diagnosis == Diagnosis::PolarizationInverted) {
-        reasons.extend(wrong_order(input, decoded, pixels, !wrong));
+        let found = wrong_order(input, decoded, pixels, !wrong);
+        let moved = reasons.iter_mut().find(|reason| reason.diagnosis == Diagnosis::Motion);
+        match (found, moved) {
+            // Pairs that were exchanged add up all the same: where something moved, it is that which put edges, or words,
+            // where they cannot be.
+            (Some(found), Some(moved)) => {
+                moved.severity = Verdict::Failed;
+                moved.evidence["order"] = found.evidence;
+            }
+            (found, _) => reasons.extend(found),
+        }
     }
     reasons.extend(saturated(decoded, pixels));
     reasons.extend(polarization(input, decoded, pixels));

@@ -54,8 +54,9 @@ pub(in crate::report::diagnosis) fn is_automatic(frames: Frames) -> bool {
 
 /// Whether the light of the frames goes up and down more than once over, or a few frames stand out from the rest. A lamp
 /// that warms up and automatic exposure go one way; where the references were exposed otherwise than all pairs, as
-/// automatic exposure does, no few frames stand out.
-fn is_to_and_fro(coarse: &[View], shifted: &[Case]) -> bool {
+/// automatic exposure does, no few frames stand out; nor are those the ones of a flicker that are the last of all, where the
+/// light stayed as they have it (`drifted`).
+fn is_to_and_fro(coarse: &[View], shifted: &[Case], drifted: bool) -> bool {
     if shifted.iter().all(|case| case.look.is_none()) {
         return true;
     }
@@ -70,14 +71,16 @@ fn is_to_and_fro(coarse: &[View], shifted: &[Case]) -> bool {
     }
     if shifted.iter().any(|case| !coarse.iter().any(|view| std::ptr::eq(case.view.pair, view.pair))) {
         // A single fine pair.
-        return true;
+        return !drifted;
     }
     let (low, high) = changes.iter().fold((f64::MAX, f64::MIN), |(l, h), &c| (l.min(c), h.max(c)));
     let range = high - low;
     let travel: f64 = changes.windows(2).map(|two| (two[1] - two[0]).abs()).sum();
     let middle = statistics::median(&mut changes.clone()).unwrap_or(0.0);
-    let odd = changes.iter().filter(|&&change| (change - middle).abs() > 0.5 * range).count();
-    let few = odd as f64 <= FEW_FRAMES * changes.len() as f64 && middle.abs() < 0.3 * range;
+    let is_odd = |change: &&f64| (*change - middle).abs() > 0.5 * range;
+    let odd = changes.iter().filter(is_odd).count();
+    let stays = drifted && changes.iter().rev().take_while(is_odd).count() == odd;
+    let few = odd as f64 <= FEW_FRAMES * changes.len() as f64 && middle.abs() < 0.3 * range && !stays;
     travel >= TRAVEL * range || few
 }
 
@@ -108,7 +111,7 @@ pub(super) fn brightness(
     let drifted = drift.is_some_and(|drift| drift.abs() > DRIFT);
     let automatic = frames.is_some_and(|frames| frames.adjusts);
     let to_and_fro =
-        !shifted.is_empty() && !automatic && trend.abs() < TREND && is_to_and_fro(coarse, shifted);
+        !shifted.is_empty() && !automatic && trend.abs() < TREND && is_to_and_fro(coarse, shifted, drifted);
     let one_way = !shifted.is_empty() && (frames.is_some() || trend.abs() >= TREND);
     if !to_and_fro && (drifted || one_way || automatic) {
         let modulation = frames.and_then(|frames| frames.modulation_drift());
