@@ -1,8 +1,7 @@
 //! A display that does not settle, told by frames in the order in which they were taken. Each then is a mixture of its own
-//! picture and of the frame before, `F = (1 - r) I + r B`, in the same proportion everywhere (exactly so for a first-order
-//! response that is sampled at equal intervals). The own pictures of a pair sum to the same light `C` in all pairs, so that
-//! for two pairs with the frames before them `P + Q - r (B + P) = (1 - r) C` gives
-//! `r = (P1 + Q1 - P2 - Q2) / (B1 + P1 - B2 - P2)` at each pixel, without any reference. Where a frame shows another
+//! picture and of the frame before, `F = (1 - r) I + r B`, in about the same proportion everywhere. The own pictures of a
+//! pair sum to the same light `C` in all pairs, so that `P + Q - r (B + P) = (1 - r) C`, and two pairs with the frames
+//! before them give `r = (P1 + Q1 - P2 - Q2) / (B1 + P1 - B2 - P2)` without any reference. Where a frame shows another
 //! picture, something moved or the light changed, no one `r` fits.
 
 use polscan_patterns::Role;
@@ -20,8 +19,11 @@ const LEAST_PIXELS: usize = 100;
 const TELLING: f64 = 0.1;
 /// How far P and Q must be apart, in units of the noise, to tell the bright one.
 const APART_SIGMA: f64 = 4.0;
-/// How far the rests of pixels of one kind may be from those of another.
+/// How far the rests of pixels of one kind may be from those of another, and the part of the rest that they may be apart
+/// besides: between two exposures the display settles further than it had for the first of them, which the frames do not
+/// show. Other causes leave one kind without any.
 const TOLERANCE: f64 = 0.03;
+const SETTLES_FURTHER: f64 = 0.4;
 /// Rests that are a reason, and that are not the frame before itself.
 const RESTS: std::ops::Range<f64> = 0.04..0.9;
 /// Share of the neighbouring pairs that must tell of a rest, and their least number.
@@ -64,7 +66,7 @@ pub fn rest(
     let middles = || middles.iter().flatten().copied();
     let (low, high) = (middles().fold(f64::MAX, f64::min), middles().fold(f64::MIN, f64::max));
     let rest = 0.5 * (low + high);
-    (both_ways && high - low <= TOLERANCE && RESTS.contains(&rest)).then_some(rest)
+    (both_ways && high - low <= TOLERANCE + SETTLES_FURTHER * rest && RESTS.contains(&rest)).then_some(rest)
 }
 
 /// The rest that most neighbouring pairs of a scan agree to have, the frames being in the order of the capture.
@@ -97,15 +99,15 @@ mod tests {
     fn own(frame: usize, at: usize) -> f64 {
         let gray = at ^ (at >> 1);
         let bright = (gray >> (11 - frame / 2)) & 1 == 1;
-        100.0 + if bright == (frame % 2 == 0) { 1000.0 } else { 0.0 }
+        100.0 + if bright == frame.is_multiple_of(2) { 1000.0 } else { 0.0 }
     }
 
     /// Frames of which each is what `mix` makes of its own picture and of the frame before, with noise.
-    fn taken(mix: impl Fn(usize, f64, f64) -> f64) -> Vec<Vec<u16>> {
+    fn taken(mut mix: impl FnMut(usize, usize, f64, f64) -> f64) -> Vec<Vec<u16>> {
         let mut before = vec![100.0; LEN];
         (0..6)
             .map(|frame| {
-                let seen: Vec<f64> = (0..LEN).map(|at| mix(frame, own(frame, at), before[at])).collect();
+                let seen: Vec<f64> = (0..LEN).map(|at| mix(frame, at, own(frame, at), before[at])).collect();
                 let noisy = seen.iter().enumerate().map(|(at, dn)| {
                     let seed = random(frame as u64 + 9) ^ random(at as u64);
                     (dn + NOISE.variance(*dn).sqrt() * normal(seed)).max(0.0).round() as u16
@@ -126,21 +128,41 @@ mod tests {
     #[test]
     fn a_rest_of_any_size_is_measured() {
         for share in [0.06, 0.2, 0.45, 0.7] {
-            let rest = found(&taken(|_, own, before| own + share * (before - own)));
+            let rest = found(&taken(|_, _, own, before| own + share * (before - own)));
             assert!(rest.is_some_and(|rest| (rest - share).abs() < 0.02), "{share}: {rest:?}");
         }
     }
 
     #[test]
+    fn a_rest_of_what_settled_further_between_the_exposures_is_found() {
+        for share in [0.1, 0.3, 0.5] {
+            for further in [0.2, 0.7] {
+                let mut picture = vec![100.0; LEN];
+                let frames = taken(|_, at, own, before| {
+                    let left = before + further * (picture[at] - before);
+                    picture[at] = own;
+                    own + share * (left - own)
+                });
+                // As a share of the frame before, which has less contrast than the picture that is left.
+                let rest = found(&frames);
+                assert!(
+                    rest.is_some_and(|rest| (0.9..2.0).contains(&(rest / share))),
+                    "{share} {further}: {rest:?}"
+                );
+            }
+        }
+    }
+
+    #[test]
     fn nothing_else_is_a_rest() {
-        assert_eq!(found(&taken(|_, own, _| own)), None, "nothing");
+        assert_eq!(found(&taken(|_, _, own, _| own)), None, "nothing");
         for stale in 1..5 {
-            let frames = taken(|frame, own, before| if frame == stale { before } else { own });
+            let frames = taken(|frame, _, own, before| if frame == stale { before } else { own });
             assert_eq!(found(&frames), None, "frame {stale} stale");
         }
         for brighter in 1..5 {
             for gain in [0.8, 1.2] {
-                let frames = taken(|frame, own, _| if frame == brighter { gain * own } else { own });
+                let frames = taken(|frame, _, own, _| if frame == brighter { gain * own } else { own });
                 assert_eq!(found(&frames), None, "frame {brighter} by {gain}");
             }
         }
