@@ -23,9 +23,9 @@ const APART_SIGMA: f64 = 4.0;
 /// besides: between two exposures the display settles further than it had for the first of them, which the frames do not
 /// show. Other causes leave one kind without any.
 const TOLERANCE: f64 = 0.03;
-const SETTLES_FURTHER: f64 = 0.4;
+const SETTLES_FURTHER: f64 = 1.0;
 /// Rests that are a reason, and that are not the frame before itself.
-const RESTS: std::ops::Range<f64> = 0.04..0.9;
+const RESTS: std::ops::Range<f64> = 0.04..1.2;
 /// Share of the neighbouring pairs that must tell of a rest, and their least number.
 const FITTING: f64 = 0.7;
 const LEAST_FITTING: usize = 3;

@@ -66,6 +66,8 @@ fn is_to_and_fro(coarse: &[View], shifted: &[Case], drifted: bool) -> bool {
         match case.and_then(|case| case.look.as_ref()) {
             Some(look) if look.is_offset => changes.extend([look.change; 2]),
             Some(look) => changes.extend(look.gains),
+            // One that changed by just too little to be a case did not go back to nothing.
+            None if view.is_shifted() => {}
             None => changes.extend([0.0; 2]),
         }
     }
