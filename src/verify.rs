@@ -1,11 +1,14 @@
 //! The judge of a live capture: each pair is checked by its pair sum the moment it is complete, against the
 //! references taken first.
 
+mod history;
+
 use std::sync::Arc;
 
 use polscan_drivers::frame::{Frame, PixelStore, Pixels};
 use polscan_patterns::{Axis, Role, Sequence};
 
+use self::history::{History, lasting};
 use crate::{
     decode::{
         CameraResponse, NoiseModel, PairContext, Plane, PlaneSource, SharedPlane, Thresholds, estimate_noise,
@@ -77,6 +80,7 @@ pub struct PairSumJudge {
     noise_pairs: u32,
     /// The pair before, as long as noise is estimated.
     last_pair: Option<Pair>,
+    history: History,
 }
 
 impl PairSumJudge {
@@ -95,6 +99,7 @@ impl PairSumJudge {
             witnesses: Vec::new(),
             noise_pairs: 0,
             last_pair: None,
+            history: History::default(),
         }
     }
 
@@ -315,14 +320,20 @@ impl Judge for PairSumJudge {
             Role::ReferenceV | Role::Black => self.low = Some(frame.clone()),
             Role::Code { .. } => {}
         }
+        self.history.reference(frame, matches!(role, Role::ReferenceH | Role::White));
     }
 
     fn pair(&mut self, axis: Axis, bit: u8, frame: &Frame, inverse: &Frame) -> PairVerdict {
         let pair = Pair { axis, bit, frames: [frame.clone(), inverse.clone()] };
         self.learn_noise(&pair);
+        let known = self.history.pair([frame, inverse], &self.camera, self.noise);
         let verdict = match (&self.high, &self.low) {
             (Some(high), Some(low)) => self.judge(axis, bit, [frame, inverse], [high, low]),
             _ => self.against_first(pair),
+        };
+        let verdict = match known {
+            Some(known) => verdict.map(|verdict| lasting(verdict, known)),
+            None => verdict,
         };
         verdict.unwrap_or_else(|| {
             PairVerdict::Degraded(Suspicion {
@@ -338,7 +349,8 @@ impl Judge for PairSumJudge {
         match change {
             Some(change) => match drift_rule(role, &change, &self.limits) {
                 PairVerdict::Retake(suspicion)
-                    if suspicion.reason == "stale-frame" && !self.is_another(first, last) =>
+                    if suspicion.reason == "stale-frame"
+                        && (self.history.is_unsettled() || !self.is_another(first, last)) =>
                 {
                     // The next picture would carry the same rest.
                     PairVerdict::Degraded(Suspicion { reason: "unsettled-display".into(), ..suspicion })

@@ -70,6 +70,8 @@ pub struct Frames<'a> {
     pub last_references: bool,
     /// Whether the camera adjusted its exposure to the pictures: then frames may differ by any factor.
     pub adjusts: bool,
+    /// Share of the frame before that each frame was found to have.
+    pub rest: Option<f64>,
 }
 
 /// What a closer look at one pair shows.
@@ -143,7 +145,7 @@ impl Look {
 impl<'a> Frames<'a> {
     /// Frames of which nothing is held against them yet.
     pub fn new(all: &'a [(Role, Plane<'a>)], settings: &'a DecodeSettings, decoded: &'a Decoded) -> Self {
-        Self { all, settings, decoded, last_references: true, adjusts: false }
+        Self { all, settings, decoded, last_references: true, adjusts: false, rest: None }
     }
 
     /// Frames of a role in the order of the sequence.

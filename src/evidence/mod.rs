@@ -1,7 +1,9 @@
 //! What one pair of frames shows, and what that is called: the one place of these rules. The judge of a live capture asks
 //! it of a pair that does not add up, and the report asks it again of all pairs of a scan.
 
+pub mod exposure;
 mod look;
+pub mod settling;
 
 use crate::{
     decode::{NoiseModel, PairResidual, Plane},

@@ -151,3 +151,53 @@ fn noise_is_the_smallest_of_four_pairs() {
     verdicts(&mut judge, &[(5, good), (6, wild)]);
     assert_eq!(judge.noise, settled);
 }
+
+/// Reasons of the verdicts on the pairs of bits 0 to 6, the frames being what `expose` makes of each picture (levels in DN
+/// by column) and of the levels of the frame before; the references come first.
+fn reasons_in_a_row(mut expose: impl FnMut(&[f64], &[f64]) -> Vec<f64>) -> Vec<String> {
+    let mut judge = judge(Mode::Pse, Some(NOISE));
+    let (mut before, mut taken) = (vec![0.0; WIDTH], 0);
+    let mut take = |lit: &dyn Fn(usize) -> bool| {
+        let picture: Vec<f64> = (0..WIDTH).map(|x| if lit(x) { 1100.0 } else { 100.0 }).collect();
+        before = expose(&picture, &before);
+        taken += 1;
+        levels(taken, |x| before[x])
+    };
+    judge.reference(Role::ReferenceV, &take(&|_| false));
+    judge.reference(Role::ReferenceH, &take(&|_| true));
+    let pairs = (0..7).map(|bit| {
+        let [frame, inverse] = [take(&|x| set(bit, x)), take(&|x| !set(bit, x))];
+        match judge.pair(Axis::Column, bit, &frame, &inverse) {
+            PairVerdict::Accept => "accept".to_owned(),
+            PairVerdict::Degraded(found) => found.reason,
+            PairVerdict::Retake(found) => format!("again: {}", found.reason),
+        }
+    });
+    pairs.collect()
+}
+
+#[test]
+fn a_display_that_does_not_settle_is_named_from_the_second_pair_on() {
+    for rest in [0.3, 0.6] {
+        let mix = |own: f64, before: f64| (1.0 - rest) * own + rest * before;
+        let found = reasons_in_a_row(|picture, before| {
+            picture.iter().zip(before).map(|(own, before)| mix(*own, *before)).collect()
+        });
+        let others = found[1..].iter().filter(|reason| *reason != "unsettled-display" && *reason != "accept");
+        assert_eq!(others.count(), 0, "{rest}: {found:?}");
+        assert!(found[1..].iter().any(|reason| reason == "unsettled-display"), "{rest}: {found:?}");
+    }
+}
+
+#[test]
+fn a_camera_that_adjusts_itself_is_named_once_enough_frames_answer_to_those_before() {
+    let mut gain = 0.0_f64;
+    let found = reasons_in_a_row(|picture, _| {
+        let seen: Vec<f64> = picture.iter().map(|level| level * gain.exp()).collect();
+        let mean = seen.iter().sum::<f64>() / WIDTH as f64;
+        gain -= 0.15 * (mean / 1300.0).ln();
+        seen
+    });
+    assert!(found[4..].iter().all(|reason| reason == "exposure-drift" || reason == "accept"), "{found:?}");
+    assert!(found.iter().any(|reason| reason == "exposure-drift"), "{found:?}");
+}

@@ -3,8 +3,8 @@
 //! Each fault is judged twice: by the live scan, which may take frames again, and by `polscan decode` of what a recorder
 //! without any checks makes of the same rig: pictures in the order in which they arrived, without receipts or stamps.
 //!
-//! `POLSCAN_FAULTS_SEEDS` (20), `POLSCAN_FAULTS_SCALE` (2: half of the paper's rig along each side; 1: all of it),
-//! `POLSCAN_FAULTS_ONLY` (part of a fault's name), `POLSCAN_FAULTS_OUT` (a file for the table).
+//! `POLSCAN_FAULTS_SEEDS` (20), `POLSCAN_FAULTS_SCALE` (3: a third of the paper's rig along each side; 1: all of it),
+//! `POLSCAN_FAULTS_ONLY` (part of a fault's name), `POLSCAN_FAULTS_OUT` (a file for the table, written after each seed).
 
 mod cases;
 mod recorder;
@@ -17,7 +17,10 @@ use std::{
     env,
     fmt::Write as _,
     fs,
-    sync::atomic::{AtomicU64, Ordering},
+    sync::{
+        Mutex, PoisonError,
+        atomic::{AtomicUsize, Ordering},
+    },
     thread,
 };
 
@@ -56,30 +59,16 @@ fn every_fault_is_named_and_none_ends_in_a_wrong_cloud_called_ok() {
         env::var(name).map_or(default, |text| text.parse().unwrap_or_else(|_| panic!("{name}: a number")))
     };
     let seeds = number("POLSCAN_FAULTS_SEEDS", 20.0) as u64;
-    let scale = number("POLSCAN_FAULTS_SCALE", 2.0);
+    let scale = number("POLSCAN_FAULTS_SCALE", 3.0);
     let only = env::var("POLSCAN_FAULTS_ONLY").unwrap_or_default();
-    let mut rows = Vec::new();
-    let cases = cases::all();
-    for case in cases.iter().filter(|case| case.name.contains(&only)) {
-        let mut tallies = [Tally::default(), Tally::default()];
-        for (seed, [live, alone]) in (1..).zip(run_all(case, seeds, scale)) {
-            for (way, (tally, found)) in ["live", "alone"].iter().zip(tallies.iter_mut().zip([live, alone])) {
-                let Some(found) = found else { continue };
-                let expected = if *way == "live" { case.live } else { case.alone };
-                println!(
-                    "{} seed {seed} {way}: {} ({}), wrong {:?}, all {:?}",
-                    case.name, found.headline, found.verdict, found.wrong, found.all
-                );
-                tally.add(&found, expected);
-            }
+    let cases: Vec<Case> = cases::all().into_iter().filter(|case| case.name.contains(&only)).collect();
+    let out = env::var("POLSCAN_FAULTS_OUT").ok();
+    let rows = run_all(&cases, seeds, scale, |rows, seeds| {
+        if let Some(path) = &out {
+            fs::write(path, table(rows, seeds, scale)).unwrap_or_else(|error| panic!("{path}: {error}"));
         }
-        rows.push((case, tallies));
-    }
-    let table = table(&rows, seeds, scale);
-    println!("{table}");
-    if let Ok(path) = env::var("POLSCAN_FAULTS_OUT") {
-        fs::write(&path, &table).unwrap_or_else(|error| panic!("{path}: {error}"));
-    }
+    });
+    println!("{}", table(&rows, seeds, scale));
     let mut failures = Vec::new();
     for (case, tallies) in &rows {
         for (way, tally) in ["live", "alone"].iter().zip(tallies) {
@@ -95,26 +84,51 @@ fn every_fault_is_named_and_none_ends_in_a_wrong_cloud_called_ok() {
     assert!(failures.is_empty(), "{}", failures.join("\n"));
 }
 
-/// All seeds of a fault, as many at once as the machine has processors.
-fn run_all(case: &Case, seeds: u64, scale: f64) -> Vec<[Option<Found>; 2]> {
-    let next = AtomicU64::new(1);
+/// A fault with its tallies of the live scan and of the frames alone.
+type Row<'a> = (&'a Case, [Tally; 2]);
+
+/// All faults with one seed after the other, as many at once as the machine has processors; `report` sees the rows each time
+/// that all scans of a seed and of those before it have ended.
+fn run_all<'a>(
+    cases: &'a [Case],
+    seeds: u64,
+    scale: f64,
+    report: impl Fn(&[Row<'a>], u64) + Sync,
+) -> Vec<Row<'a>> {
+    let rows: Vec<Row> = cases.iter().map(|case| (case, Default::default())).collect();
+    let (next, done) = (AtomicUsize::new(0), Mutex::new((rows, 0)));
     let work = || {
-        let mut done = Vec::new();
         loop {
-            let seed = next.fetch_add(1, Ordering::Relaxed);
+            let job = next.fetch_add(1, Ordering::Relaxed);
+            let (seed, index) = ((job / cases.len()) as u64 + 1, job % cases.len());
             if seed > seeds {
-                return done;
+                return;
             }
-            done.push((seed, run(case, seed, scale)));
+            let case = &cases[index];
+            let found = run(case, seed, scale);
+            let mut done = done.lock().unwrap_or_else(PoisonError::into_inner);
+            let (rows, ended) = &mut *done;
+            let ways = [("live", case.live), ("alone", case.alone)].into_iter().zip(found);
+            for (tally, ((way, expected), found)) in rows[index].1.iter_mut().zip(ways) {
+                let Some(found) = found else { continue };
+                println!(
+                    "{} seed {seed} {way}: {} ({}), wrong {:?}, all {:?}",
+                    case.name, found.headline, found.verdict, found.wrong, found.all
+                );
+                tally.add(&found, expected);
+            }
+            *ended += 1;
+            if *ended % cases.len() == 0 {
+                report(rows, (*ended / cases.len()) as u64);
+            }
         }
     };
     let workers = thread::available_parallelism().map_or(1, usize::from);
-    let mut done: Vec<_> = thread::scope(|scope| {
+    thread::scope(|scope| {
         let running: Vec<_> = (0..workers).map(|_| scope.spawn(work)).collect();
-        running.into_iter().flat_map(|worker| worker.join().expect("no scan panics")).collect()
+        running.into_iter().for_each(|worker| worker.join().expect("no scan panics"));
     });
-    done.sort_by_key(|(seed, _)| *seed);
-    done.into_iter().map(|(_, found)| found).collect()
+    done.into_inner().unwrap_or_else(PoisonError::into_inner).0
 }
 
 fn run(case: &Case, seed: u64, scale: f64) -> [Option<Found>; 2] {
@@ -171,7 +185,7 @@ impl Tally {
     }
 }
 
-fn table(rows: &[(&Case, [Tally; 2])], seeds: u64, scale: f64) -> String {
+fn table(rows: &[Row], seeds: u64, scale: f64) -> String {
     let mut text = format!("Seeds 1 to {seeds}, the paper's rig divided by {scale}.\n\n");
     text.push_str("| fault | judged by | named right | called | most wrong in `ok` | in `degraded` |\n");
     text.push_str("|---|---|---|---|---|---|\n");

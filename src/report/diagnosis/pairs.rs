@@ -161,6 +161,12 @@ pub fn diagnose(decoded: &Decoded, frames: Option<Frames>) -> Vec<Reason> {
         coarse.clone_from(&views);
     }
     let Sorted { sound, mut shifted, mut disturbed } = sort(&coarse, frames, !decoded.noise_estimated);
+    if let Some(rest) = frames.and_then(|frames| frames.rest)
+        && !(shifted.is_empty() && disturbed.is_empty())
+    {
+        disturbed.append(&mut shifted);
+        return vec![disturbed::unsettled(&disturbed, rest)];
+    }
     if frames.is_some_and(|frames| frames.adjusts) {
         // Where both references were exposed otherwise than the pairs, dark pixels keep a rest that no gain of the pair
         // explains; another picture is off on a large part of the image, whatever the exposure.

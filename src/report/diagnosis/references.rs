@@ -18,6 +18,16 @@ fn pixels(plane: Plane<'_>) -> Pixels<'_> {
     }
 }
 
+/// Whether a first reference shows the picture of the other one: then all pairs disagree with it, and nothing moved.
+pub fn is_repeated(frames: Frames) -> bool {
+    frames.all_references().is_some_and(|[bright, dark]| match (&bright[..], &dark[..]) {
+        ([first_bright, .., last_bright], [first_dark, .., last_dark]) => {
+            frames.are_alike(*first_bright, *first_dark) && !frames.are_alike(*last_bright, *last_dark)
+        }
+        _ => false,
+    })
+}
+
 /// The reason where a last reference shows another picture than the first. What moved between them shows in the pairs.
 pub fn disagree(frames: Frames) -> Option<Reason> {
     let roles = [Role::ReferenceV, Role::ReferenceH, Role::Black, Role::White];

@@ -6,7 +6,7 @@ use super::{Diagnosis, Reason, Verdict, captured, dark, order, pairs, polarity, 
 use crate::{
     cloud::RowCheck,
     decode::{Class, Decoded},
-    evidence::Frames,
+    evidence::{Frames, settling},
     report::{
         CaptureSummary, PixelCounts, ReportInput,
         statistics::{self, share},
@@ -79,17 +79,23 @@ fn from_pixels(input: &ReportInput, decoded: &Decoded, pixels: &PixelCounts) -> 
     let mut look = look.map(|settings| Frames::new(input.planes, settings, decoded));
     if let Some(frames) = &mut look {
         frames.adjusts = pairs::is_automatic(*frames);
+        frames.rest = settling::rest_of_all(*frames);
     }
-    // References that were exposed otherwise are no other pictures.
-    let disagree = look.filter(|frames| !frames.adjusts).and_then(references::disagree);
+    // References that were exposed otherwise, or carry rests of others, are no other pictures.
+    let disagree =
+        look.filter(|frames| !frames.adjusts && frames.rest.is_none()).and_then(references::disagree);
     if let (Some(frames), true) = (&mut look, disagree.is_some()) {
         frames.last_references = false;
     }
     let mut reasons = pairs::diagnose(decoded, look);
     if let Some(disagree) = disagree {
         // A drift between references that show different pictures is none.
-        reasons
-            .retain(|reason| !matches!(reason.diagnosis, Diagnosis::ExposureDrift | Diagnosis::AmbientDrift));
+        let repeated = look.is_some_and(references::is_repeated);
+        reasons.retain(|reason| match reason.diagnosis {
+            Diagnosis::ExposureDrift | Diagnosis::AmbientDrift => false,
+            Diagnosis::Motion => !repeated,
+            _ => true,
+        });
         // Behind a lost frame the references are out of place as well.
         if !reasons.iter().any(|reason| reason.diagnosis == Diagnosis::LostFrame) {
             reasons.push(disagree);
@@ -107,7 +113,17 @@ fn from_pixels(input: &ReportInput, decoded: &Decoded, pixels: &PixelCounts) -> 
     // A wrong frame puts edges in wrong places, too: that would be said twice.
     let wrong = reasons.iter().any(is_wrong);
     if !wrong || !reasons.iter().any(|reason| reason.diagnosis == Diagnosis::PolarizationInverted) {
-        reasons.extend(wrong_order(input, decoded, pixels, !wrong));
+        let found = wrong_order(input, decoded, pixels, !wrong);
+        let moved = reasons.iter_mut().find(|reason| reason.diagnosis == Diagnosis::Motion);
+        match (found, moved) {
+            // Pairs that were exchanged add up all the same: where something moved, it is that which put edges, or words,
+            // where they cannot be.
+            (Some(found), Some(moved)) => {
+                moved.severity = Verdict::Failed;
+                moved.evidence["order"] = found.evidence;
+            }
+            (found, _) => reasons.extend(found),
+        }
     }
     reasons.extend(saturated(decoded, pixels));
     reasons.extend(polarization(input, decoded, pixels));

@@ -42,7 +42,7 @@ pub(super) fn disturbance(disturbed: &[Case], coarse: usize, frames: Option<Fram
         .collect();
     if 2 * rests.len() > disturbed.len() {
         let rest = statistics::median(&mut rests.clone()).unwrap_or(0.0);
-        return unsettled(disturbed, rest, all_evidence(disturbed));
+        return unsettled(disturbed, rest);
     }
     let share = disturbed.iter().map(Case::share).fold(0.0, f64::max);
     let looks: Vec<&Look> = disturbed.iter().filter_map(|case| case.look.as_ref()).collect();
@@ -55,7 +55,7 @@ pub(super) fn disturbance(disturbed: &[Case], coarse: usize, frames: Option<Fram
     let moved = same.map_or(share < WHOLE_FRAME, |same| same >= SAME_PIXELS);
     match strength {
         _ if moved => motion(disturbed, share, evidence),
-        Some(rest) if rest < STALE_SHARE => unsettled(disturbed, rest, evidence),
+        Some(rest) if rest < STALE_SHARE => unsettled(disturbed, rest),
         _ => Reason::failed(
             Diagnosis::StaleFrame,
             format!(
@@ -70,7 +70,7 @@ pub(super) fn disturbance(disturbed: &[Case], coarse: usize, frames: Option<Fram
     }
 }
 
-fn unsettled(disturbed: &[Case], rest: f64, evidence: Value) -> Reason {
+pub(super) fn unsettled(disturbed: &[Case], rest: f64) -> Reason {
     Reason::degraded(
         Diagnosis::UnsettledDisplay,
         format!(
@@ -80,7 +80,7 @@ fn unsettled(disturbed: &[Case], rest: f64, evidence: Value) -> Reason {
             names(disturbed),
             100.0 * rest,
         ),
-        evidence,
+        all_evidence(disturbed),
     )
 }
 
@@ -145,7 +145,7 @@ fn one_frame(disturbed: &[Case]) -> Reason {
         Some(Cause::Torn(row)) => torn(disturbed, row),
         Some(Cause::OtherPicture) => stale(disturbed, share),
         None if share >= WHOLE_FRAME => stale(disturbed, share),
-        Some(Cause::Rest(rest)) => unsettled(disturbed, rest, all_evidence(disturbed)),
+        Some(Cause::Rest(rest)) => unsettled(disturbed, rest),
         _ => motion(disturbed, share, all_evidence(disturbed)),
     }
 }

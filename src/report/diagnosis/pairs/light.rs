@@ -5,93 +5,58 @@ use serde_json::json;
 
 use super::{Case, View, all_evidence, names};
 use crate::{
-    decode::{Decoded, Plane},
-    evidence::{Frames, sample},
+    decode::Decoded,
+    evidence::{
+        Frames,
+        exposure::{self, Exposure, Gauge},
+    },
     report::{
         diagnosis::{Diagnosis, Reason},
         statistics,
     },
 };
 
-/// Whether the brightness of each frame answers to the frame before, as automatic exposure does: the step from one gain
-/// to the next falls in proportion to the logarithm of the mean of the former, `e' = e - s (ln mean - c)`, by less than
-/// it rises.
-///
-/// A lamp knows nothing of the pictures. One that beats by the angle `w` per frame has steps that correlate with its own
-/// brightness by `-sqrt((1 - cos w) / 2)` along a slope of `cos w - 1`: where the slope is that of a correction, short of
-/// -1.1, the correlation is short of -0.75. What the pictures themselves change of the mean weakens both, among few frames
-/// not always alike, so that more is asked for: a camera that adjusts itself follows its rule closely. The gains are those
-/// of bright pixels against the first bright reference, so that neither the other frame of a pair nor what the
-/// references were exposed like enters; steps within pairs alone are tried, too, for pairs that were taken again.
+/// Whether the brightness of each frame answers to the frame before, as automatic exposure does: see [`exposure`]. The
+/// gains are those of bright pixels against the first bright reference, so that neither the other frame of a pair nor what
+/// the references were exposed like enters; steps within pairs alone are tried, too, for pairs that were taken again.
 pub(in crate::report::diagnosis) fn is_automatic(frames: Frames) -> bool {
     let Some([bright, _]) = frames.all_references() else { return false };
     let Some(&reference) = bright.first() else { return false };
-    // Per frame: its place in the scan, the logarithms of its gain and of its mean, and whether it is the first of a pair.
-    let mut found: Vec<(usize, [f64; 2], bool)> = Vec::new();
+    let class = frames.decoded.class.data();
+    let gauge = Gauge {
+        reference,
+        black_dn: frames.decoded.black_level_dn,
+        saturation_dn: frames.settings.camera.saturation_dn,
+    };
+    // Per frame: its place in the scan, its brightness, and whether it is the first of a pair.
+    let mut found: Vec<(usize, Exposure, bool)> = Vec::new();
     for view in super::views(&frames.decoded.pairs).iter().filter(|view| view.rank >= super::FINE_RANKS) {
         let role = Role::Code { axis: view.pair.axis, bit: view.pair.bit, inverse: false };
         let Some(place) = frames.all.iter().position(|(other, _)| *other == role) else { continue };
         let Some((_, inverse)) = frames.all.get(place + 1) else { continue };
         let pair = [frames.all[place].1, *inverse];
         for which in 0..2 {
-            let gain = gain(frames, pair[which], pair[1 - which], reference);
-            let mean = mean(frames, pair[which]).ln();
-            found.extend(gain.map(|gain| (place + which, [gain, mean], which == 0)));
+            let exposure = gauge.exposure(pair[which], pair[1 - which], |at| class[at].is_lit());
+            found.extend(exposure.map(|exposure| (place + which, exposure, which == 0)));
         }
     }
     found.sort_by_key(|(place, ..)| *place);
-    let gains = || found.iter().map(|(_, [gain, _], _)| *gain);
-    if gains().fold(f64::MIN, f64::max) - gains().fold(f64::MAX, f64::min) < LEAST_SWING {
+    if !exposure::swings(found.iter().map(|(_, exposure, _)| *exposure)) {
         return false;
     }
     let answers = |within_pairs: bool| {
         let next = found.windows(2).filter(|two| two[1].0 == two[0].0 + 1 && (!within_pairs || two[0].2));
-        let steps: Vec<[f64; 2]> = next.map(|two| [two[0].1[1], two[1].1[0] - two[0].1[0]]).collect();
-        let (correlation, slope) = correlation(&steps);
-        steps.len() >= LEAST_STEPS && correlation < -ANSWERS && (-SLOPE..-LEAST_SLOPE).contains(&slope)
+        let steps: Vec<[f64; 2]> = next.map(|two| two[0].1.step_to(two[1].1)).collect();
+        steps.len() >= LEAST_STEPS && exposure::answers(&steps)
     };
     answers(false) || answers(true)
 }
 
-/// Logarithm of the brightness of a frame against the reference, where the frame shows the bright light, too.
-fn gain(frames: Frames, frame: Plane<'_>, other: Plane<'_>, reference: Plane<'_>) -> Option<f64> {
-    let decoded = frames.decoded;
-    let (black, saturation) = (decoded.black_level_dn, f64::from(frames.settings.camera.saturation_dn));
-    let class = decoded.class.data();
-    let mut gains: Vec<f64> = (0..class.len())
-        .step_by((class.len() / GAIN_PIXELS).max(1))
-        .filter(|&at| class[at].is_lit())
-        .map(|at| [frame, other, reference].map(|plane| sample(plane, at)))
-        .filter(|samples| samples.iter().all(|&dn| dn < saturation))
-        .map(|samples| samples.map(|dn| dn - black))
-        // Noise of a bright pixel is small beside this.
-        .filter(|&[here, other, reference]| here > 2.0 * other.max(BRIGHT_DN) && reference > BRIGHT_DN)
-        .map(|[here, _, reference]| (here / reference).ln())
-        .collect();
-    if gains.len() < LEAST_GAINS { None } else { statistics::median(&mut gains).and_then(statistics::finite) }
-}
-
-/// Mean of a frame above black, in DN.
-fn mean(frames: Frames, plane: Plane<'_>) -> f64 {
-    let places = (0..plane.len()).step_by((plane.len() / 10_000).max(1));
-    let count = places.len().max(1) as f64;
-    (places.map(|at| sample(plane, at)).sum::<f64>() / count - frames.decoded.black_level_dn).max(1.0)
-}
-
-/// Correlation of the second values with the first, and the slope of their line.
-fn correlation(steps: &[[f64; 2]]) -> (f64, f64) {
-    let count = steps.len() as f64;
-    let middle = |index: usize| steps.iter().map(|step| step[index]).sum::<f64>() / count;
-    let (x, y) = (middle(0), middle(1));
-    let sum = |of: fn(f64, f64) -> f64| steps.iter().map(|step| of(step[0] - x, step[1] - y)).sum::<f64>();
-    let (xx, yy, xy) = (sum(|a, _| a * a), sum(|_, b| b * b), sum(|a, b| a * b));
-    (statistics::finite(xy / (xx * yy).sqrt()).unwrap_or(0.0), statistics::finite(xy / xx).unwrap_or(0.0))
-}
-
 /// Whether the light of the frames goes up and down more than once over, or a few frames stand out from the rest. A lamp
 /// that warms up and automatic exposure go one way; where the references were exposed otherwise than all pairs, as
-/// automatic exposure does, no few frames stand out.
-fn is_to_and_fro(coarse: &[View], shifted: &[Case]) -> bool {
+/// automatic exposure does, no few frames stand out; nor are those the ones of a flicker that are the last of all, where the
+/// light stayed as they have it (`drifted`).
+fn is_to_and_fro(coarse: &[View], shifted: &[Case], drifted: bool) -> bool {
     if shifted.iter().all(|case| case.look.is_none()) {
         return true;
     }
@@ -101,19 +66,23 @@ fn is_to_and_fro(coarse: &[View], shifted: &[Case]) -> bool {
         match case.and_then(|case| case.look.as_ref()) {
             Some(look) if look.is_offset => changes.extend([look.change; 2]),
             Some(look) => changes.extend(look.gains),
+            // One that changed by just too little to be a case did not go back to nothing.
+            None if view.is_shifted() => {}
             None => changes.extend([0.0; 2]),
         }
     }
     if shifted.iter().any(|case| !coarse.iter().any(|view| std::ptr::eq(case.view.pair, view.pair))) {
         // A single fine pair.
-        return true;
+        return !drifted;
     }
     let (low, high) = changes.iter().fold((f64::MAX, f64::MIN), |(l, h), &c| (l.min(c), h.max(c)));
     let range = high - low;
     let travel: f64 = changes.windows(2).map(|two| (two[1] - two[0]).abs()).sum();
     let middle = statistics::median(&mut changes.clone()).unwrap_or(0.0);
-    let odd = changes.iter().filter(|&&change| (change - middle).abs() > 0.5 * range).count();
-    let few = odd as f64 <= FEW_FRAMES * changes.len() as f64 && middle.abs() < 0.3 * range;
+    let is_odd = |change: &&f64| (*change - middle).abs() > 0.5 * range;
+    let odd = changes.iter().filter(is_odd).count();
+    let stays = drifted && changes.iter().rev().take_while(is_odd).count() == odd;
+    let few = odd as f64 <= FEW_FRAMES * changes.len() as f64 && middle.abs() < 0.3 * range && !stays;
     travel >= TRAVEL * range || few
 }
 
@@ -125,19 +94,8 @@ const DRIFT: f64 = 0.02;
 /// How many times its range the light must travel from frame to frame for going to and fro: once over is 1, up and down
 /// again 2.
 const TRAVEL: f64 = 2.5;
-/// Steps from frame to frame that automatic exposure is told by, how far they must go with the mean of the frame before,
-/// and the range of corrections: all of the error, and so little that it does not show within a scan.
+/// Steps from frame to frame that automatic exposure is told by.
 const LEAST_STEPS: usize = 8;
-const ANSWERS: f64 = 0.95;
-const SLOPE: f64 = 1.1;
-const LEAST_SLOPE: f64 = 0.01;
-/// Least swing of the gains, as a logarithm: less is no reason.
-const LEAST_SWING: f64 = 0.02;
-/// About so many pixels are looked at for the gain of a frame, and so many must show it.
-const GAIN_PIXELS: usize = 40_000;
-const LEAST_GAINS: usize = 100;
-/// Least level of a bright pixel in DN.
-const BRIGHT_DN: f64 = 8.0;
 /// Share of the frames that are few.
 const FEW_FRAMES: f64 = 0.15;
 /// Share of the drift that the modulation must take part in for lamp or exposure to be its cause.
@@ -155,7 +113,7 @@ pub(super) fn brightness(
     let drifted = drift.is_some_and(|drift| drift.abs() > DRIFT);
     let automatic = frames.is_some_and(|frames| frames.adjusts);
     let to_and_fro =
-        !shifted.is_empty() && !automatic && trend.abs() < TREND && is_to_and_fro(coarse, shifted);
+        !shifted.is_empty() && !automatic && trend.abs() < TREND && is_to_and_fro(coarse, shifted, drifted);
     let one_way = !shifted.is_empty() && (frames.is_some() || trend.abs() >= TREND);
     if !to_and_fro && (drifted || one_way || automatic) {
         let modulation = frames.and_then(|frames| frames.modulation_drift());
