@@ -148,9 +148,10 @@ impl Layers {
         let settings = raw.and_then(|raw| {
             let mut found = Vec::new();
             let settings = Settings::validate(raw, folder, &mut found);
+            let unread = faults.len();
             for (key, message) in found {
-                // A key that already has a fault was put back to its default, so that what follows from it is noise.
-                if !faults.iter().any(|fault| fault.key == key) {
+                // A key that could not be read was put back to its default, so that what follows from it is noise.
+                if !faults[..unread].iter().any(|fault| fault.key == key) {
                     let origin = self.origin_of(&key);
                     faults.push(Fault { key, message, origin });
                 }

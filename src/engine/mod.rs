@@ -8,6 +8,7 @@ mod recorded;
 mod results;
 mod salvage;
 mod scan;
+mod setup;
 mod shown;
 
 pub use failure::{Failure, Kind};

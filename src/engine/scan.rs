@@ -1,36 +1,28 @@
 //! The stages of a scan.
 
-use std::time::Duration;
-
-use polscan_drivers::{
-    camera::{AppliedSettings, CameraInfo, StreamStatistics},
-    projector::ProjectorInfo,
-};
+use polscan_drivers::camera::{AppliedSettings, StreamStatistics};
 use polscan_patterns::{Mode, ProjectorSize, Role, Sequence};
 
 use super::{
     Failure,
     results::{self, Results},
+    setup::{calibration, plan, response, setup},
 };
 use crate::{
     app::{Rig, RigError},
     cloud::ReconstructSettings,
     config::Settings,
-    decode::{Accumulator, CameraResponse, DecodeSettings, NoiseModel, SharedPlane},
-    geometry::{Calibration, ReadHints},
+    decode::{Accumulator, DecodeSettings, SharedPlane},
+    geometry::Calibration,
     pipeline::{self, Context, Job, PipelineError},
     report::{
         self, CaptureSummary, Diagnosis, NamedRegion, Reason, Report, ReportInput, Size, check_regions,
     },
-    sequencer::{
-        CancelFlag, CaptureFailure, CaptureRecord, PartialCapture, Plan, PlanError, PlanOptions, Progress,
-        capture,
-    },
+    sequencer::{CancelFlag, CaptureFailure, CaptureRecord, PartialCapture, Plan, Progress, capture},
     store::{
         BundleWriter, Manifest,
         bundle::FRAMES_FILE_NAME,
         manifest::{self, FrameFiles, Processing, Volume},
-        source::{SensorPart, read_calibration_for},
     },
     truth::Truth,
     verify::{PairSumJudge, shared_plane},
@@ -374,73 +366,6 @@ fn partial_record(plan: &Plan, partial: PartialCapture) -> CaptureRecord {
         statistics: partial.statistics.unwrap_or_default(),
         notes: partial.notes,
     }
-}
-
-fn response(applied: &AppliedSettings) -> CameraResponse {
-    CameraResponse {
-        bit_depth: applied.settings.format.bit_depth(),
-        black_level_dn: applied.black_level_dn,
-        saturation_dn: applied.saturation_dn,
-        noise: applied.noise.map(|noise| NoiseModel {
-            gain_dn_per_electron: noise.gain_dn_per_electron,
-            read_noise_dn: noise.read_noise_dn,
-        }),
-    }
-}
-
-fn plan(
-    settings: &Settings,
-    sequence: Sequence,
-    projector: &ProjectorInfo,
-    applied: AppliedSettings,
-) -> Result<Plan, Failure> {
-    let (timing, limits) = (&settings.raw.projector, &settings.raw.capture);
-    let options = PlanOptions {
-        hold_refreshes: (timing.hold_refreshes > 0).then_some(timing.hold_refreshes),
-        trigger_delay: (timing.trigger_delay_ms > 0.0)
-            .then(|| Duration::from_secs_f64(timing.trigger_delay_ms * 1e-3)),
-        retakes_each: limits.retakes_per_pair,
-        retakes_total: limits.retakes_per_scan,
-        ..PlanOptions::default()
-    };
-    Plan::new(sequence, settings.polarization, projector, applied, &options)
-        .map_err(|error: PlanError| setup("plan the capture", error))
-}
-
-/// The rig's calibration, for the frames that the camera delivers: one of the whole sensor is cut to its region.
-fn calibration(
-    settings: &Settings,
-    applied: &AppliedSettings,
-    camera: &CameraInfo,
-    projector: ProjectorSize,
-) -> Result<Option<Calibration>, Failure> {
-    let Some(calibration) = &settings.calibration else {
-        return Ok(None);
-    };
-    let frame = (applied.width, applied.height);
-    let projector = (projector.width, projector.height);
-    let fail = |error: Box<dyn std::error::Error + Send + Sync>| {
-        Failure::data(format!("use the calibration {}", calibration.path.display()), error)
-    };
-    let hints = ReadHints {
-        camera_size: Some(frame),
-        projector_size: Some(projector),
-        swap: calibration.projector_left,
-        unit_mm: calibration.unit_mm,
-    };
-    let part = applied.settings.region.map(|region| SensorPart {
-        sensor: (camera.sensor_width, camera.sensor_height),
-        origin: (region.x, region.y),
-    });
-    let calibrated =
-        read_calibration_for(&calibration.path, &hints, part).map_err(|error| fail(error.into()))?;
-    calibrated.check_sizes(frame, projector).map_err(|e| fail(e.into()))?;
-    Ok(Some(calibrated))
-}
-
-/// Settings that do not go together.
-fn setup(operation: &'static str, error: impl std::error::Error + Send + Sync + 'static) -> Failure {
-    Failure::Setup { operation, source: Box::new(error) }
 }
 
 /// A rig that cannot be opened, as a failure.
