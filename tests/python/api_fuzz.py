@@ -206,6 +206,13 @@ SETTINGS = """
 [checks]
 # 503 says that the rig cannot scan now, 501 that a calibration is not part of the service: both are documented.
 not_a_server_error.expected-statuses = ["2xx", "3xx", "4xx", "501", "503"]
+
+# How many patterns there are is the projector's to say, and not the document's.
+[[operations]]
+include-name = "PUT /v1/projector"
+
+[operations.checks]
+positive_data_acceptance.expected-statuses = ["2xx", "401", "403", "409", "422", "429", "5xx"]
 """
 
 HOOKS = """
