@@ -165,6 +165,12 @@ pub trait Camera: Send {
     /// Identity and abilities.
     fn info(&self) -> &CameraInfo;
 
+    /// Whether it is still there, as far as is known without asking it: what is lost while nobody uses it is opened again
+    /// before somebody does.
+    fn alive(&self) -> Result<(), DeviceError> {
+        Ok(())
+    }
+
     /// Applies all settings and reads each back. Refuses, with all differences, what it cannot honour exactly
     /// (exposure within the camera's own step). Only while disarmed.
     fn apply(&mut self, settings: &CameraSettings) -> Result<AppliedSettings, DeviceError>;

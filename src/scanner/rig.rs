@@ -191,23 +191,22 @@ pub fn run(shared: &Shared, commands: &Receiver<Command>) {
         }
         let wait =
             if open.is_none() { next_try.saturating_duration_since(Instant::now()).min(TICK) } else { TICK };
-        let command = match commands.recv_timeout(wait) {
-            Ok(command) => command,
-            Err(RecvTimeoutError::Timeout) => continue,
-            Err(RecvTimeoutError::Disconnected) => break,
-        };
-        let broken = match (command, &mut open) {
-            (Command::Scan(job), Some(rig)) => rig.scan(shared, *job),
-            (Command::Show(shown, reply), Some(rig)) => {
+        let broken = match (commands.recv_timeout(wait), &mut open) {
+            (Err(RecvTimeoutError::Disconnected), _) => break,
+            (Err(RecvTimeoutError::Timeout), open) => {
+                open.as_ref().and_then(|rig| rig.rig.camera.alive().err()).map(|error| error.to_string())
+            }
+            (Ok(Command::Scan(job)), Some(rig)) => rig.scan(shared, *job),
+            (Ok(Command::Show(shown, reply)), Some(rig)) => {
                 let _ = reply.send(rig.show(shared, shown));
                 None
             }
-            (Command::Preview, Some(rig)) => {
+            (Ok(Command::Preview), Some(rig)) => {
                 let broken = rig.preview(shared).err().map(|error| error.to_string());
                 shared.tell(News::Previewed);
                 broken
             }
-            (command, None) => {
+            (Ok(command), None) => {
                 refuse(shared, command);
                 None
             }
@@ -297,7 +296,10 @@ impl Open {
         let (news, broken) = match outcome {
             Ok(Ok(captured)) => {
                 let failure = captured.taken.failure();
-                let broken = failure.filter(|reason| reason.diagnosis == Diagnosis::DeviceFault);
+                // A camera that stopped sending may be helped by being opened again; one that is well loses a moment.
+                let broken = failure.filter(|reason| {
+                    matches!(reason.diagnosis, Diagnosis::DeviceFault | Diagnosis::LostFrame)
+                });
                 let broken = broken.map(|reason| reason.message.clone());
                 (News::Taken(Box::new(captured)), broken)
             }
@@ -378,8 +380,8 @@ impl Open {
         let disarmed = camera.disarm();
         match taken {
             Ok(frame) => shared.preview.offer(&frame, &self.prepared.applied),
-            // One frame more or less does not matter here.
-            Err(DeviceError::Timeout { .. }) => {}
+            // One frame more or less does not matter here, nor one that lost a packet.
+            Err(DeviceError::Timeout { .. } | DeviceError::BadData { .. }) => {}
             Err(error) => return Err(error),
         }
         disarmed.map(|_| ())

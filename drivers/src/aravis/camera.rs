@@ -121,6 +121,10 @@ impl Camera for AravisCamera {
         &self.info
     }
 
+    fn alive(&self) -> Result<(), DeviceError> {
+        self.gone.get().map_or(Ok(()), |gone| Err(gone.clone()))
+    }
+
     fn apply(&mut self, settings: &CameraSettings) -> Result<AppliedSettings, DeviceError> {
         let settings = settings.clone();
         self.ask(|reply| Command::Apply(settings, reply), Duration::ZERO)

@@ -7,9 +7,6 @@ use crate::clock::Timestamp;
 /// Numbers of a 16-bit counter: 1 to 65535, 0 is none.
 const SHORT_CYCLE: u64 = 65535;
 
-/// A first frame that comes this long after its trigger is believed to answer a later one.
-const FIRST_ANSWER: Duration = Duration::from_secs(2);
-
 /// Turns the numbers that a camera gives its frames into numbers since arming.
 #[derive(Debug, Clone)]
 pub struct FrameIds {
@@ -52,8 +49,10 @@ impl FrameIds {
 ///
 /// The camera's own clock decides where it can: a trigger that the camera missed must not shift all later answers by
 /// one.
-#[derive(Debug, Clone, Default)]
+#[derive(Debug, Clone)]
 pub struct Pairing {
+    /// A first frame that comes this long after its trigger is believed to answer a later one.
+    first_answer: Duration,
     pending: VecDeque<(u64, Timestamp)>,
     sent: u64,
     /// Least difference between the camera's clock at a frame and the rig's clock at its trigger.
@@ -62,6 +61,11 @@ pub struct Pairing {
 }
 
 impl Pairing {
+    /// Of a camera whose frames are here `first_answer` after their triggers at the latest.
+    pub fn new(first_answer: Duration) -> Self {
+        Self { first_answer, pending: VecDeque::new(), sent: 0, offset_ns: None, latest: (0, Timestamp(0)) }
+    }
+
     /// A trigger for `start` was sent.
     pub fn sent(&mut self, start: Timestamp) {
         self.pending.push_back((self.sent, start));
@@ -86,7 +90,7 @@ impl Pairing {
                 (0..possible).min_by_key(distance).unwrap_or(0)
             }
             _ => (0..possible - 1)
-                .take_while(|&index| received.since(self.pending[index].1) > FIRST_ANSWER)
+                .take_while(|&index| received.since(self.pending[index].1) > self.first_answer)
                 .count(),
         };
         self.latest = self.pending.drain(..=chosen).next_back().unwrap_or(self.latest);
@@ -141,6 +145,8 @@ mod tests {
         Timestamp(ms * 1_000_000)
     }
 
+    const ANSWER: Duration = Duration::from_millis(240);
+
     const CAMERA_STARTED_NS: u64 = 77_000_000_000;
 
     fn device(ms: u64) -> Option<u64> {
@@ -149,7 +155,7 @@ mod tests {
 
     #[test]
     fn a_missed_trigger_does_not_shift_the_later_answers() {
-        let mut pairing = Pairing::default();
+        let mut pairing = Pairing::new(ANSWER);
         for start in [100, 200, 300] {
             pairing.sent(ms(start));
         }
@@ -165,7 +171,7 @@ mod tests {
 
     #[test]
     fn without_a_device_clock_answers_come_in_order() {
-        let mut pairing = Pairing::default();
+        let mut pairing = Pairing::new(ANSWER);
         for start in [100, 200, 9000] {
             pairing.sent(ms(start));
         }
@@ -178,9 +184,11 @@ mod tests {
 
     #[test]
     fn a_first_trigger_that_nothing_answered_for_long_is_given_up() {
-        let mut pairing = Pairing::default();
+        let mut pairing = Pairing::new(ANSWER);
         pairing.sent(ms(100));
-        pairing.sent(ms(5000));
-        assert_eq!(pairing.answer(device(5001), ms(5020)), (1, ms(5000)));
+        pairing.sent(ms(450));
+        assert_eq!(pairing.answer(device(451), ms(470)), (1, ms(450)));
+        pairing.sent(ms(800));
+        assert_eq!(pairing.answer(device(801), ms(820)), (2, ms(800)));
     }
 }

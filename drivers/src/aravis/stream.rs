@@ -34,6 +34,9 @@ const SPARE_BUFFERS: usize = 6;
 /// Most buffers of one stream, whatever is asked for.
 const MOST_BUFFERS: usize = 256;
 
+/// Longest that a frame takes from the end of its readout to this machine, less than whoever waits for it is patient for.
+const DELIVERY: Duration = Duration::from_millis(200);
+
 /// Buffers that outlive a stream: the same ones are used over and over.
 #[derive(Debug)]
 pub struct Pool {
@@ -135,7 +138,11 @@ impl Running {
             device: device.to_owned(),
             clock,
             ids: FrameIds::new(camera.is_gv_device()),
-            pairing: Pairing::default(),
+            pairing: Pairing::new(
+                microseconds(applied.settings.settings.exposure_us)
+                    + microseconds(applied.settings.readout_us)
+                    + DELIVERY,
+            ),
             frames: 0,
             failed: 0,
             copied: 0,
@@ -150,10 +157,10 @@ impl Running {
 
     /// A trigger was sent for `start`.
     pub fn triggered(&mut self, start: Timestamp) {
-        let us = |us: f64| Duration::try_from_secs_f64(1e-6 * us).unwrap_or_default();
         let settings = &self.applied.settings;
         // One frame is read out while the next is exposed, but not two at once.
-        self.ready = start + us(settings.settings.exposure_us).max(us(settings.readout_us));
+        let exposure = microseconds(settings.settings.exposure_us);
+        self.ready = start + exposure.max(microseconds(settings.readout_us));
         self.pairing.sent(start);
     }
 
@@ -271,4 +278,9 @@ impl Running {
     pub fn fail(&self, error: &DeviceError) {
         let _ = self.arrivals.send(Err(error.clone()));
     }
+}
+
+/// A length that a camera gives; none where it is no number.
+fn microseconds(us: f64) -> Duration {
+    Duration::try_from_secs_f64(1e-6 * us).unwrap_or_default()
 }

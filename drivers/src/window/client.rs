@@ -81,9 +81,13 @@ impl WindowProjector {
             self.clock.sleep_until(now + wait);
             let started = start(&self.options, &self.want).and_then(|(process, hello)| {
                 let has = info(&hello);
-                let same = |info: &ProjectorInfo| (info.serial.clone(), info.width, info.height);
-                let named =
-                    |info: &ProjectorInfo| format!("{} with {} x {}", info.serial, info.width, info.height);
+                let same = |info: &ProjectorInfo| {
+                    (info.serial.clone(), info.width, info.height, info.refresh_period)
+                };
+                let named = |info: &ProjectorInfo| {
+                    let hz = info.refresh_period.as_secs_f64().recip();
+                    format!("{} with {} x {} at {hz:.2} Hz", info.serial, info.width, info.height)
+                };
                 if same(&has) == same(&self.info) {
                     return Ok(process);
                 }

@@ -139,12 +139,13 @@ impl Process {
 impl Drop for Process {
     fn drop(&mut self) {
         let _ = self.stream.shutdown(std::net::Shutdown::Both);
-        if let Some(child) = &mut self.child
-            && ended(child, ENDING).is_none()
+        if let Some(mut child) = self.child.take()
+            && ended(&mut child, ENDING).is_none()
         {
-            // It does not listen. Both calls fail only where it has ended meanwhile.
+            // It does not listen. Both calls fail only where it has ended meanwhile; one that a GPU's driver holds may not
+            // end for long, and nobody has to wait for it.
             let _ = child.kill();
-            let _ = child.wait();
+            std::thread::spawn(move || drop(child.wait()));
         }
     }
 }

@@ -5,7 +5,7 @@ use std::{
     os::{
         fd::AsFd,
         unix::{
-            fs::PermissionsExt,
+            fs::{FileTypeExt, PermissionsExt},
             net::{UnixListener, UnixStream},
         },
     },
@@ -80,8 +80,12 @@ pub fn inherited() -> io::Result<Client> {
 
 /// Listens at `path` for ever, one client after the other; each is read on a thread of its own.
 pub fn listen(path: &Path, proxy: EventLoopProxy<News>) -> io::Result<()> {
-    // What a process left behind that was killed. A file that is no socket stays and is the error.
-    if UnixStream::connect(path).is_err_and(|error| error.kind() == io::ErrorKind::ConnectionRefused) {
+    // What a process left behind that was killed. A file that is no socket refuses connections as well: it stays, and is
+    // the error.
+    let socket = std::fs::symlink_metadata(path).is_ok_and(|entry| entry.file_type().is_socket());
+    if socket
+        && UnixStream::connect(path).is_err_and(|error| error.kind() == io::ErrorKind::ConnectionRefused)
+    {
         std::fs::remove_file(path)?;
     }
     let listener = UnixListener::bind(path)?;
