@@ -127,9 +127,14 @@ fn boards_of_all_kinds_are_found_whole_and_right_side_up_however_they_lie() {
     // Each of these tells its ends apart.
     let boards = [checkerboard(8, 5), charuco(false), charuco(true), circles(4, 9, true)];
     for board in boards {
-        for (turn, tilt) in
-            [(4.0, [0.0, 0.0]), (100.0, [8e-4, -3e-4]), (181.0, [-9e-4, 5e-4]), (-75.0, [2e-4, 1e-3])]
-        {
+        for (turn, tilt) in [
+            (0.0, [0.0, 0.0]),
+            (4.0, [0.0, 0.0]),
+            (90.0, [0.0, 0.0]),
+            (100.0, [8e-4, -3e-4]),
+            (181.0, [-9e-4, 5e-4]),
+            (-75.0, [2e-4, 1e-3]),
+        ] {
             let scene = scene(&board, 3.1, turn, tilt);
             let found = find(&board, &scene).unwrap_or_else(|error| panic!("{board:?} {turn}: {error}"));
             assert_eq!(found.corners.len(), board.points().len(), "{board:?} {turn}");
@@ -175,8 +180,8 @@ fn part_of_a_board_with_markers_is_enough_and_of_one_without_is_refused() {
     let found = find(&board, &scene_of(&board)).unwrap();
     assert!((12..30).contains(&found.corners.len()), "{}", found.corners.len());
     let (miss, _) = misses(&scene_of(&board), &found);
-    // The edge of what hides the board crosses the windows of a few corners.
-    assert!(miss < 0.2, "{miss}");
+    // Corners that the edge of what hides the board runs through are left out.
+    assert!(miss < 0.08, "{miss}");
     let board = checkerboard(9, 6);
     let refused = find(&board, &scene_of(&board)).unwrap_err();
     assert!(matches!(refused, DetectError::Extent { wanted: [8, 5], .. }), "{refused}");
