@@ -7,6 +7,9 @@
 //! Codes are judged without a calibration: with one, a gate refuses pixels where row and column contradict it, and
 //! towards the corners these calibrations are off by several projector pixels. Depth is judged with it, where it fits.
 
+#[path = "captures/boards.rs"]
+mod boards;
+
 use std::{
     env, fs,
     io::Read as _,
@@ -126,6 +129,15 @@ fn path_text(path: &Path) -> String {
     path.to_str().expect("a path of plain text").to_owned()
 }
 
+/// Folder of all captures.
+fn captures() -> Option<PathBuf> {
+    let captures = env::var_os("POLSCAN_CAPTURES").map(PathBuf::from);
+    if captures.is_none() {
+        println!("captures: did not run: POLSCAN_CAPTURES is not set");
+    }
+    captures
+}
+
 /// A capture made into a bundle.
 struct Capture {
     name: String,
@@ -138,10 +150,7 @@ struct Capture {
 impl Capture {
     /// Makes `tests/captures/NAME` and `POLSCAN_CAPTURES/DATA` into a bundle. `None` without captures.
     fn open(name: &str, data: &str) -> Option<Self> {
-        let Some(captures) = env::var_os("POLSCAN_CAPTURES").map(PathBuf::from) else {
-            println!("captures: did not run: POLSCAN_CAPTURES is not set");
-            return None;
-        };
+        let captures = captures()?;
         assert!(captures.join(data).is_dir(), "POLSCAN_CAPTURES={} has no {data}", captures.display());
         let folder = tempfile::tempdir().expect("a folder for the bundle");
         let capture = Self { name: name.into(), captures, folder };

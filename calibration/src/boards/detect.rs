@@ -21,6 +21,8 @@ const CALM_PX: f64 = 1.0;
 const WINDOW: (f64, f64) = (6.0, 0.2);
 /// A corner whose edges miss it by as many times the median is not used.
 const MOST_MISFIT: f64 = 1.5;
+/// So is one whose window changes by half a turn: this share, or as many times the median where noise or shading does it.
+const MOST_LOPSIDED: (f64, f64) = (0.2, 2.0);
 /// Bits of a marker run into each other where edges are wider than this many bits.
 const WIDEST_IN_BITS: f64 = 1.2;
 /// Fewer corners of a board in pieces are not worth having.
@@ -269,9 +271,11 @@ fn measured(board: &Board, picture: &Picture, seen: &[Seen], points: &[Point]) -
         .collect();
     // Where a finger, a shadow or the end of the projector's light crosses the window, edges miss the point.
     let limit = MOST_MISFIT * median(refined.iter().map(|(_, refined)| refined.misfit_px).collect());
+    let lopsided = median(refined.iter().map(|(_, refined)| refined.lopsided).collect());
+    let most_lopsided = MOST_LOPSIDED.0.max(MOST_LOPSIDED.1 * lopsided);
     let mut corners: Vec<FoundCorner> = refined
         .into_iter()
-        .filter(|(_, refined)| refined.misfit_px <= limit)
+        .filter(|(_, refined)| refined.misfit_px <= limit && refined.lopsided <= most_lopsided)
         .filter_map(|(id, refined)| {
             let board_mm = points.get(id as usize)?.board_mm;
             let corner = Corner { id, board_mm, camera_px: refined.at };

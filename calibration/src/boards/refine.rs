@@ -13,6 +13,9 @@ pub(super) struct Refined {
     /// How far edges miss the point, in px, weighted by their gradients. Their width makes it some tenths; where
     /// something else reaches into the window it is more.
     pub(super) misfit_px: f64,
+    /// What of the window changes by half a turn about the point, as a share of what does not. Squares that meet look the
+    /// same after half a turn, what hides some of them does not.
+    pub(super) lopsided: f64,
 }
 
 /// Steps of the iteration at most.
@@ -89,7 +92,24 @@ fn step(picture: &Picture, at: [f64; 2], reach: f64, noise: f64) -> Option<Refin
         at: [at[0] + move_by[0], at[1] + move_by[1]],
         sigma_px: worse.sqrt(),
         misfit_px: (misfit / (xx + yy)).sqrt(),
+        lopsided: lopsided(picture, at, side),
     })
+}
+
+/// Odd part of the square of half-width `side` about a place, over its even part.
+fn lopsided(picture: &Picture, at: [f64; 2], side: i64) -> f64 {
+    let places = (-side..=side).flat_map(|v| (-side..=side).map(move |u| (u as f64, v as f64)));
+    let pairs: Vec<(f64, f64)> = places
+        .map(|(u, v)| {
+            let here = picture.sample([at[0] + u, at[1] + v]);
+            let opposite = picture.sample([at[0] - u, at[1] - v]);
+            (here - opposite, here + opposite)
+        })
+        .collect();
+    let mean = pairs.iter().map(|(_, sum)| sum).sum::<f64>() / pairs.len() as f64;
+    let odd: f64 = pairs.iter().map(|(difference, _)| difference * difference).sum();
+    let even: f64 = pairs.iter().map(|(_, sum)| (sum - mean).powi(2)).sum();
+    (odd / even).sqrt()
 }
 
 /// Standard deviation of a picture's noise, from how neighbours differ (Immerkaer 1996), by the median: edges are few.

@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use super::{
     board,
+    output::Output,
     result::{self, Subject},
     views::{Views, name_of, read_picture},
 };
@@ -30,7 +31,7 @@ pub struct Args {
 
 /// Calibrates and writes; returns the exit code.
 pub fn run(args: &Args, json: bool) -> Result<u8, Failure> {
-    let writer = result::claim(&args.out)?;
+    let output = Output::create(&args.out)?;
     let board = board::read(&args.board, args.measured_mm)?;
     let gates = args.limits.given()?.unwrap_or_default();
     let mut views = Views::default();
@@ -40,7 +41,7 @@ pub fn run(args: &Args, json: bool) -> Result<u8, Failure> {
     }
     result::solve(
         &Subject { board: &board, views: &views, gates, baseline_mm: None },
-        writer,
+        output,
         &args.out,
         json,
     )

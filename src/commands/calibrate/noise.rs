@@ -37,7 +37,12 @@ pub fn run(place: &Place, settings: &Settings, json: bool) -> Result<u8, Failure
     for (name, plot) in plots(&measured) {
         output.plot(name, &plot)?;
     }
-    output.finish(&place.out, &report(&measured, &file), &Summary { lines: lines(&measured), refused }, json)
+    output.finish(
+        &place.out,
+        &report(&measured, &file),
+        &Summary { lines: lines(&measured), refused: refused.into_iter().collect() },
+        json,
+    )
 }
 
 fn file(measured: &Measured) -> NoiseFile {

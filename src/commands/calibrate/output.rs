@@ -48,8 +48,8 @@ pub struct Output {
 pub struct Summary {
     /// Lines for a person.
     pub lines: Vec<String>,
-    /// Why no file for scans was written; `None` where one was.
-    pub refused: Option<String>,
+    /// Why no file for scans was written; empty where one was.
+    pub refused: Vec<String>,
 }
 
 impl Output {
@@ -71,6 +71,13 @@ impl Output {
         self.add(T::FILE_NAME, file.to_toml().as_bytes())
     }
 
+    /// Adds a picture.
+    pub fn png(&mut self, name: &str, picture: &image::RgbImage) -> Result<(), Failure> {
+        self.writer.png(name, picture).map_err(failed)?;
+        self.files.push(name.into());
+        Ok(())
+    }
+
     /// Adds a plot.
     pub fn plot(&mut self, name: &str, plot: &Plot) -> Result<(), Failure> {
         self.add(name, plot.file().as_bytes())
@@ -84,21 +91,25 @@ impl Output {
         summary: &Summary,
         json: bool,
     ) -> Result<u8, Failure> {
+        let accepted = summary.refused.is_empty();
         let text = serde_json::to_vec_pretty(report).expect("numbers and text are JSON");
         self.add("report.json", &text)?;
         self.writer.finish_plain().map_err(failed)?;
         if json {
-            say(
-                serde_json::json!({ "out": out, "files": self.files, "refused": summary.refused, "report": report }),
-            );
+            let refused = (!accepted).then(|| summary.refused.join("; "));
+            let mut answer =
+                serde_json::json!({ "out": out, "files": self.files, "refused": refused, "report": report });
+            // Only optics are accepted as a whole: the first angle of a polarizer is neither accepted nor refused.
+            if let Some(accepted) = report.get("accepted") {
+                answer["accepted"] = accepted.clone();
+            }
+            say(answer);
         } else {
             summary.lines.iter().for_each(say);
-            if let Some(refused) = &summary.refused {
-                say(format_args!("refused: {refused}"));
-            }
+            summary.refused.iter().for_each(|refused| say(format_args!("refused: {refused}")));
             say(format_args!("{} in {}", self.files.join(", "), out.display()));
         }
-        Ok(if summary.refused.is_some() { FAILED } else { 0 })
+        Ok(if accepted { 0 } else { FAILED })
     }
 }
 

@@ -105,6 +105,7 @@ pub fn run(args: &Args, settings: &Settings, json: bool) -> Result<u8, Failure> 
         "drive": measured.drive,
     });
     let lines = lines(&measured, found.as_ref());
+    let refused = refused.into_iter().collect();
     output.finish(&args.place.out, &report, &Summary { lines, refused }, json)
 }
 

@@ -7,16 +7,19 @@ use std::{
 
 use serde_json::{Value, json};
 
-use super::{pictures, views::Views};
+use super::{
+    output::{Output, Summary},
+    pictures,
+    views::Views,
+};
 use crate::{
     calibration::{
         boards::Board,
         rig::{Calibrated, Gates, Refused, Setup, calibrate, guidance},
     },
-    commands::{failure::FAILED, say},
     engine::Failure,
     geometry::Calibration,
-    store::{BundleWriter, error::StorageError, time::rfc3339_utc},
+    store::time::rfc3339_utc,
 };
 
 /// Schema of the report.
@@ -41,15 +44,6 @@ impl Limits {
         let text = std::fs::read_to_string(path).map_err(|error| Failure::data(operation.clone(), error))?;
         toml::from_str(&text).map(Some).map_err(|error| Failure::data(operation, error))
     }
-}
-
-/// Claims the folder of the result, before any work.
-pub fn claim(out: &Path) -> Result<BundleWriter, Failure> {
-    BundleWriter::create(out, None, 0).map_err(failed)
-}
-
-fn failed(error: StorageError) -> Failure {
-    Failure::storage("write the calibration", error)
 }
 
 /// What is calibrated, from what.
@@ -80,33 +74,30 @@ pub fn setup(views: &Views, gates: Gates, baseline_mm: Option<f64>) -> Result<Se
 }
 
 /// Solves, writes everything and prints; returns the exit code.
-pub fn solve(subject: &Subject<'_>, writer: BundleWriter, out: &Path, json: bool) -> Result<u8, Failure> {
+pub fn solve(subject: &Subject<'_>, mut output: Output, out: &Path, json: bool) -> Result<u8, Failure> {
     let Subject { board, views, .. } = *subject;
     let setup = setup(views, subject.gates, subject.baseline_mm)?;
     let result = calibrate(&views.views, &setup);
-    let mut files = vec!["report.json", "coverage.png"];
-    writer.png("coverage.png", &pictures::coverage(&views.views, setup.camera.size)).map_err(failed)?;
     if let Ok(calibrated) = &result {
         let calibration = dated(calibrated);
-        writer.bytes("calibration.toml", calibration.to_toml().as_bytes()).map_err(failed)?;
-        writer.bytes("opencv.yaml", calibration.to_opencv_yaml().as_bytes()).map_err(failed)?;
-        writer.png("residuals.png", &pictures::residuals(&views.views, calibrated)).map_err(failed)?;
-        files.splice(0..0, ["calibration.toml", "opencv.yaml", "residuals.png"]);
+        output.add("calibration.toml", calibration.to_toml().as_bytes())?;
+        output.add("opencv.yaml", calibration.to_opencv_yaml().as_bytes())?;
+        output.png("residuals.png", &pictures::residuals(&views.views, calibrated))?;
     }
+    output.png("coverage.png", &pictures::coverage(&views.views, setup.camera.size))?;
     let missing = guidance(&views.views, &setup, None);
     let report = report(subject, &result, &missing.missing, missing.views_missing);
-    let text = serde_json::to_vec_pretty(&report)
-        .map_err(|error| Failure::storage("write the calibration", error))?;
-    writer.bytes("report.json", &text).map_err(failed)?;
-    writer.finish_plain().map_err(failed)?;
-    if json {
-        say(json!({ "out": out, "accepted": result.is_ok(), "files": files, "report": report }));
-    } else {
-        say(format_args!("board: {}", board.summary()));
-        lines(views, &result, &missing.missing).iter().for_each(say);
-        say(format_args!("{} in {}", files.join(", "), out.display()));
+    let mut lines = vec![format!("board: {}", board.summary())];
+    lines.extend(self::lines(views, &result));
+    let refused: Vec<String> = match &result {
+        Ok(_) => Vec::new(),
+        Err(refused) => refused.refusals.iter().map(|refusal| refusal.message.clone()).collect(),
+    };
+    match refused.is_empty() {
+        true => lines.push("accepted".into()),
+        false => lines.extend(missing.missing.iter().map(|missing| format!("missing: {missing}"))),
     }
-    Ok(if result.is_ok() { 0 } else { FAILED })
+    output.finish(out, &report, &Summary { lines, refused }, json)
 }
 
 fn dated(calibrated: &Calibrated) -> Calibration {
@@ -142,7 +133,7 @@ fn report(
 }
 
 /// What a person reads.
-fn lines(views: &Views, result: &Result<Calibrated, Refused>, missing: &[String]) -> Vec<String> {
+fn lines(views: &Views, result: &Result<Calibrated, Refused>) -> Vec<String> {
     let mut lines: Vec<String> = views
         .unusable
         .iter()
@@ -169,13 +160,6 @@ fn lines(views: &Views, result: &Result<Calibrated, Refused>, missing: &[String]
             report.camera_rms_px,
             projector.unwrap_or_default()
         ));
-    }
-    match result {
-        Ok(_) => lines.push("accepted".into()),
-        Err(refused) => {
-            lines.extend(refused.refusals.iter().map(|refusal| format!("refused: {}", refusal.message)));
-            lines.extend(missing.iter().map(|missing| format!("missing: {missing}")));
-        }
     }
     lines
 }

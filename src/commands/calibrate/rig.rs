@@ -9,6 +9,7 @@ use polscan_patterns::Mode;
 
 use super::{
     board,
+    output::Output,
     result::{self, Subject, setup},
     session::Session,
     views::{Views, name_of, white_picture},
@@ -66,7 +67,7 @@ pub fn run(
     load: impl Fn(Option<&Path>) -> Result<Settings, ConfigError>,
     json: bool,
 ) -> Result<u8, Failure> {
-    let writer = result::claim(&args.out)?;
+    let output = Output::create(&args.out)?;
     let recorded = args.poses.is_none().then_some(args.session.as_deref()).flatten();
     let session = recorded.map(Session::read).transpose()?;
     let mut board = match (&args.board, &session) {
@@ -94,7 +95,7 @@ pub fn run(
         }
     };
     let subject = Subject { board: &board, views: &views, gates, baseline_mm: args.limits.baseline_mm };
-    result::solve(&subject, writer, &args.out, json)
+    result::solve(&subject, output, &args.out, json)
 }
 
 /// Reads recorded views, but those to drop.

@@ -32,7 +32,7 @@ pub fn run(place: &Place, settings: &Settings, json: bool) -> Result<u8, Failure
     output.finish(
         &place.out,
         &report(&found, &file),
-        &Summary { lines: lines(&found, &file), refused: None },
+        &Summary { lines: lines(&found, &file), refused: Vec::new() },
         json,
     )
 }
