@@ -41,6 +41,8 @@ enum Command {
     Calibrate(commands::Calibrate),
     /// Forecast what a rig will do from its data sheets.
     Plan(commands::PlanArgs),
+    /// Measure a known artefact: whether the rig still measures as it should, with its history.
+    Verify(commands::VerifyArgs),
     /// Write the pattern images as PNG, with the manifest that describes them.
     Patterns(Patterns),
     /// Run as a service with a REST interface.
@@ -311,6 +313,12 @@ fn dispatch(cli: &Cli) -> Result<u8, Failure> {
             commands::calibrate(what, load, cli.json)
         }
         Command::Plan(args) => commands::plan(args, cli.json),
+        Command::Verify(args) => {
+            let load = |file: Option<&Path>| {
+                layers(&ConfigArgs { config: file.map(Path::to_path_buf) }, Vec::new()).load()
+            };
+            commands::verify(args, load, cli.json)
+        }
         Command::Patterns(args) => {
             let settings = layers(&args.config, Vec::new()).load()?;
             commands::patterns(&settings, args.mode, args.size, &args.out, cli.json)

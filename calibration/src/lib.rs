@@ -3,6 +3,7 @@
 //! Slices and structs in, values out: nothing here knows files, clocks, loggers, devices or a runtime. What shows
 //! pictures, takes frames and writes files is the program's.
 
+pub mod artefact;
 pub mod boards;
 pub mod fit;
 pub mod noise;

@@ -14,6 +14,7 @@ mod progress;
 mod scan;
 mod serve;
 mod show;
+mod verify;
 
 use std::{io::Write, path::Path};
 
@@ -31,6 +32,7 @@ pub use plan::{PlanArgs, plan};
 pub use scan::scan;
 pub use serve::serve;
 pub use show::{projector, show};
+pub use verify::{VerifyArgs, verify};
 
 /// Prints a line to stdout. A reader that has gone away is no error of ours.
 fn say(text: impl std::fmt::Display) {

@@ -7,13 +7,18 @@ use crate::{
     app::Rig,
     config::Settings,
     engine::{Failure, Label, Scan, new_id, rig_failure},
-    report::NamedRegion,
+    report::{NamedRegion, Report},
     sequencer::{CancelFlag, Progress},
     store::BundleWriter,
 };
 
-/// Scans and writes; returns the exit code.
+/// Scans, writes and prints; returns the exit code.
 pub fn scan(settings: &Settings, regions: &[NamedRegion], out: &Path, json: bool) -> Result<u8, Failure> {
+    Ok(print_result(&take(settings, regions, out)?, out, json))
+}
+
+/// Scans and writes.
+pub(super) fn take(settings: &Settings, regions: &[NamedRegion], out: &Path) -> Result<Report, Failure> {
     // Checked again with the size of the scan, but an occupied folder is refused before the rig is touched.
     drop(create_writer(out, 0)?);
     let mut rig = Rig::open(settings).map_err(rig_failure)?;
@@ -35,7 +40,7 @@ pub fn scan(settings: &Settings, regions: &[NamedRegion], out: &Path, json: bool
     bar.say("decoding");
     let report = scan.finish(&taken, Label { id: new_id(), ..Label::default() }, writer)?;
     drop(bar);
-    Ok(print_result(&report, out, json))
+    Ok(report)
 }
 
 /// An interrupt from the terminal cancels the capture, which leaves the projector black. A second one ends the program.
