@@ -129,6 +129,9 @@ pub fn robust_sphere(points: &[Point]) -> Result<FittedSphere, FitError> {
     Ok(FittedSphere { centre_mm, radius_mm, covariance_mm2, inliers, share, rms_mm })
 }
 
+/// Centre and radius in mm.
+type Sphere = (Vector3<f64>, f64);
+
 fn vector(point: &Point) -> Vector3<f64> {
     Vector3::from(point.mm)
 }
@@ -199,7 +202,7 @@ pub(super) fn scatter(points: &[Point], centroid: &Vector3<f64>) -> Matrix3<f64>
 }
 
 /// Sphere by linear least squares: `|x|^2 = 2 c.x + (r^2 - |c|^2)`, about the points' mean so that digits are kept.
-fn algebraic(points: impl Iterator<Item = Vector3<f64>> + Clone) -> Option<(Vector3<f64>, f64)> {
+fn algebraic(points: impl Iterator<Item = Vector3<f64>> + Clone) -> Option<Sphere> {
     let count = points.clone().count();
     let mean = points.clone().sum::<Vector3<f64>>() / count as f64;
     let (mut matrix, mut right) = (Matrix4::zeros(), Vector4::zeros());
@@ -216,10 +219,7 @@ fn algebraic(points: impl Iterator<Item = Vector3<f64>> + Clone) -> Option<(Vect
 }
 
 /// One step on the geometric distances, and its normal matrix.
-fn gauss_newton(
-    points: &[Point],
-    (centre, radius): (Vector3<f64>, f64),
-) -> Option<((Vector3<f64>, f64), Matrix4<f64>)> {
+fn gauss_newton(points: &[Point], (centre, radius): Sphere) -> Option<(Sphere, Matrix4<f64>)> {
     let (mut matrix, mut right) = (Matrix4::zeros(), Vector4::zeros());
     for point in points {
         let out = vector(point) - centre;
