@@ -45,19 +45,19 @@ impl EventLog {
         Self { recent: Mutex::new(recent), latest: watch::Sender::new(next - 1) }
     }
 
-    /// Adds the event that `make` forms of its number.
-    pub fn add(&self, make: impl FnOnce(u64) -> Event) -> Arc<Event> {
+    /// Adds an event, which must have the number that [`next`](Self::next) gave: there is one that adds.
+    pub fn add(&self, event: Event) {
+        let id = event.id;
         let mut recent = self.recent.lock().unwrap_or_else(PoisonError::into_inner);
-        let event = Arc::new(make(recent.next));
-        recent.next += 1;
-        recent.events.push_back(event.clone());
+        debug_assert_eq!(id, recent.next, "events are numbered without gaps");
+        recent.next = id + 1;
+        recent.events.push_back(Arc::new(event));
         if recent.events.len() > IN_MEMORY {
             recent.events.pop_front();
             recent.first += 1;
         }
         drop(recent);
-        self.latest.send_replace(event.id);
-        event
+        self.latest.send_replace(id);
     }
 
     /// Number of the next event.
@@ -100,8 +100,8 @@ mod tests {
         assert_eq!(*log.latest().borrow(), 100);
         assert_eq!(log.after(99), None, "before this process");
         assert_eq!(log.after(100), Some(Vec::new()));
-        for _ in 0..5 {
-            log.add(event);
+        for id in 101..106 {
+            log.add(event(id));
         }
         let ids =
             |cursor| log.after(cursor).map(|events| events.iter().map(|event| event.id).collect::<Vec<_>>());
@@ -115,8 +115,8 @@ mod tests {
     #[test]
     fn memory_is_bounded_and_says_so() {
         let log = EventLog::new(1);
-        for _ in 0..IN_MEMORY + 10 {
-            log.add(event);
+        for id in 1..=IN_MEMORY as u64 + 10 {
+            log.add(event(id));
         }
         assert_eq!(log.after(9), None);
         let all = log.after(10).unwrap();

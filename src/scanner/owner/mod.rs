@@ -421,10 +421,12 @@ impl Owner {
                 Err(error) => tracing::error!(error = chain(&error), "event numbers are not reserved"),
             }
         }
-        let event = self.out.events.add(|id| Event { id, kind: kind.to_owned(), data: data(id) });
+        let event = Event { id: next, kind: kind.to_owned(), data: data(next) };
+        // Stored before anybody hears of it: what one reader has seen, another may ask for after a crash.
         if let Err(error) = self.index.add_event(&event) {
             tracing::warn!(error = chain(&error), "an event will not outlive this process");
         }
+        self.out.events.add(event);
     }
 
     fn publish(&mut self) {
