@@ -13,7 +13,7 @@ use serde_json::json;
 
 use super::{failure::FAILED, say, scan::take};
 use crate::{
-    cloud::read_ply,
+    cloud::{flag, read_ply},
     config::{ConfigError, Settings},
     engine::Failure,
     store::{
@@ -134,9 +134,11 @@ fn read_cloud(bundle: &Path) -> Result<Vec<PixelPoint>, Failure> {
     let at = |(index, point): (usize, crate::cloud::PlyPoint)| PixelPoint {
         x: (index % width) as u32,
         y: (index / width) as u32,
-        point: Point { mm: point.point_mm.map(f64::from), sigma_mm: f64::from(point.sigma_z_mm) },
+        point: Point { mm: point.point_mm.map(f64::from), sigma_z_mm: f64::from(point.sigma_z_mm) },
     };
-    Ok(measured.into_iter().zip(points).map(at).collect())
+    // At a silhouette a pixel sees two surfaces, and its depth is that of neither.
+    let one_surface = |(_, point): &(usize, crate::cloud::PlyPoint)| point.flags & flag::SILHOUETTE == 0;
+    Ok(measured.into_iter().zip(points).filter(one_surface).map(at).collect())
 }
 
 fn read_history(path: &Path) -> Result<Vec<Entry>, Failure> {

@@ -1,5 +1,6 @@
 //! The program from outside: commands in, folders and exit codes out, on a small copy of the paper's rig.
 
+mod acceptance;
 mod bad_input;
 mod calibrate;
 mod captures_of_the_twin;

@@ -121,7 +121,8 @@ fn a_display_of_another_size_is_not_the_same_display() {
     let smaller = Xvfb::start_at(xvfb.number, 300, 200);
     eventually("it is opened again", || {
         let error = projector.black().expect_err("another display");
-        let changed = error.to_string().contains("asked screen with 320 x 240 at 60.00 Hz, has screen with 300 x 200");
+        let changed =
+            error.to_string().contains("asked screen with 320 x 240 at 60.00 Hz, has screen with 300 x 200");
         assert!(changed || matches!(error, DeviceError::Unavailable { .. }), "{error}");
         changed
     });

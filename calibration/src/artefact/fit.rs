@@ -1,18 +1,25 @@
 //! Planes and spheres among points of which some belong to something else.
 //!
-//! A surface through few random points at a time, kept where the median distance of all points is least (least median of squares,
-//! Rousseeuw 1984), says which points belong to it; least squares over these says where it is and how sure that is.
+//! A surface through few random points at a time, kept where a quantile of the distance of all points is least (least quantile of
+//! squares, Rousseeuw 1984), says which points belong to it; least squares over these says where it is and how sure that is.
 
 use nalgebra::{Matrix3, Matrix4, SymmetricEigen, Vector3, Vector4};
 use thiserror::Error;
 
-/// A point in mm with the standard deviation that its scan gives it.
+/// A point in mm in the camera's frame with the standard deviation that its scan gives it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Point {
     /// Point.
     pub mm: [f64; 3],
-    /// Standard deviation of its distance from the surface in mm.
-    pub sigma_mm: f64,
+    /// Standard deviation of its depth in mm: it is uncertain along its ray.
+    pub sigma_z_mm: f64,
+}
+
+impl Point {
+    /// How far it moves along `normal` while its depth grows by 1 mm; negative where the surface faces the camera.
+    fn along(&self, normal: &Vector3<f64>) -> f64 {
+        normal.dot(&vector(self)) / self.mm[2].max(f64::MIN_POSITIVE)
+    }
 }
 
 /// A plane `normal . x = offset`.
@@ -61,15 +68,30 @@ pub enum FitError {
 /// Fewer points say nothing.
 pub const LEAST_POINTS: usize = 100;
 
-/// Random subsets: with half of the points foreign, one in sixteen of four points is free of them, so that all of these fail
-/// once in 10^11.
-const SUBSETS: usize = 400;
+/// Random subsets: with 60 % of the points foreign, one in 39 of four points is free of them, so that all of these fail once
+/// in 10^11.
+const SUBSETS: usize = 1000;
 
 /// Points that judge a subset, evenly spread over all.
 const JUDGES: usize = 1500;
 
 /// A point further off than this many standard deviations belongs to something else.
 const GATE: f64 = 3.5;
+
+/// Share of the points that a plane's distance is judged by.
+const PLANE_QUANTILE: f64 = 0.5;
+
+/// Likewise of a ball, which may fill no more than this of a region with a wall in it.
+const BALL_QUANTILE: f64 = 0.25;
+
+/// A ball's radius may be off by this factor. No wall looks like a ball of that size.
+const RADIUS_FACTOR: f64 = 1.5;
+
+/// First gate about a ball, as a share of its radius, above noise: what spheres through four noisy points are off by.
+const FIRST_GATE: f64 = 0.06;
+
+/// Flanks whose normal moves by less than this for a mm of depth are left out: there one pixel sees much of a slope.
+const LEAST_FACING: f64 = 0.35;
 
 /// A median absolute deviation of normal noise is this share of its standard deviation.
 const MAD_OF_SIGMA: f64 = 0.6745;
@@ -81,18 +103,22 @@ const MAD_OF_SIGMA: f64 = 0.6745;
 pub fn robust_plane(points: &[Point]) -> Result<FittedPlane, FitError> {
     let through = |corners: &[Vector3<f64>]| {
         let normal = (corners[1] - corners[0]).cross(&(corners[2] - corners[0])).try_normalize(1e-9)?;
-        let offset = normal.dot(&corners[0]);
-        Some(move |point: &Vector3<f64>| normal.dot(point) - offset)
+        Some((corners[0], normal))
     };
-    let mut inliers = consensus(points, 3, through).ok_or(FitError::NoSurface("plane"))??;
-    let mut fit = plane(&inliers).ok_or(FitError::NoSurface("plane"))?;
+    let none = FitError::NoSurface("plane");
+    let distance =
+        |(corner, normal): &(Vector3<f64>, Vector3<f64>), point: &Vector3<f64>| normal.dot(&(point - corner));
+    let (first, median) = consensus(points, (3, PLANE_QUANTILE), through, distance)?.ok_or(none)?;
+    // Few judges stretch the median of the best subset beyond that of the fit, never below.
+    let mut inliers = close(points, |point| distance(&first, &vector(point)), median / MAD_OF_SIGMA);
+    let mut fit = plane(&inliers).ok_or(none)?;
     for _ in 0..5 {
         let distance = |point: &Point| fit.1.dot(&(vector(point) - fit.0));
         inliers = close(points, distance, scale(&inliers, distance));
         if inliers.len() < LEAST_POINTS {
             return Err(FitError::TooFew(inliers.len()));
         }
-        fit = plane(&inliers).ok_or(FitError::NoSurface("plane"))?;
+        fit = plane(&inliers).ok_or(none)?;
     }
     let (centroid_mm, normal) = fit;
     let rms_mm = rms(&inliers, |point| normal.dot(&(vector(point) - centroid_mm)));
@@ -100,33 +126,59 @@ pub fn robust_plane(points: &[Point]) -> Result<FittedPlane, FitError> {
     Ok(FittedPlane { centroid_mm, normal, inliers, share, rms_mm })
 }
 
-/// The sphere that most points lie on.
+/// The sphere of about `nominal_mm` radius that most points lie on, weighted by their standard deviations across its surface.
 ///
 /// # Errors
 /// [`FitError`].
-pub fn robust_sphere(points: &[Point]) -> Result<FittedSphere, FitError> {
+pub fn robust_sphere(points: &[Point], nominal_mm: f64) -> Result<FittedSphere, FitError> {
     let through = |corners: &[Vector3<f64>]| {
-        let (centre, radius) = algebraic(corners.iter().copied())?;
-        Some(move |point: &Vector3<f64>| (point - centre).norm() - radius)
+        let (centre, radius) = algebraic(corners)?;
+        let likely = radius * RADIUS_FACTOR > nominal_mm && radius < nominal_mm * RADIUS_FACTOR;
+        likely.then_some((centre, radius))
     };
     let none = FitError::NoSurface("sphere");
-    let mut inliers = consensus(points, 4, through).ok_or(none)??;
-    let mut fit = algebraic(inliers.iter().map(vector)).ok_or(none)?;
-    let mut normal_matrix = Matrix4::identity();
-    for _ in 0..8 {
-        (fit, normal_matrix) = gauss_newton(&inliers, fit).ok_or(none)?;
-        let distance = |point: &Point| (vector(point) - fit.0).norm() - fit.1;
-        inliers = close(points, distance, scale(&inliers, distance));
+    let distance = |&(centre, radius): &Sphere, point: &Vector3<f64>| (point - centre).norm() - radius;
+    let mut sphere =
+        consensus(points, (4, BALL_QUANTILE), through, distance)?.map(|(sphere, _)| sphere).ok_or(none)?;
+    let mut inliers = on_sphere(points, &sphere, |sigma_mm| GATE * sigma_mm + FIRST_GATE * nominal_mm);
+    for _ in 0..12 {
         if inliers.len() < LEAST_POINTS {
             return Err(FitError::TooFew(inliers.len()));
         }
+        let (step, _) = gauss_newton(&inliers, &sphere).ok_or(none)?;
+        sphere = step;
+        let excess =
+            scale(&inliers, |point| off_sphere(point, &sphere).map_or(0.0, |off| off.0 / off.1)).max(1.0);
+        inliers = on_sphere(points, &sphere, |sigma_mm| GATE * excess * sigma_mm);
     }
-    let (centre_mm, radius_mm) = fit;
-    let rms_mm = rms(&inliers, |point| (vector(point) - centre_mm).norm() - radius_mm);
+    let (centre_mm, radius_mm) = sphere;
+    let (_, normal_matrix) = gauss_newton(&inliers, &sphere).ok_or(none)?;
     let inverse = normal_matrix.try_inverse().ok_or(none)?;
+    let excess = rms(&inliers, |point| off_sphere(point, &sphere).map_or(0.0, |off| off.0 / off.1)).max(1.0);
+    let rms_mm = rms(&inliers, |point| distance(&sphere, &vector(point)));
     let share = inliers.len() as f64 / points.len() as f64;
-    let covariance_mm2 = inverse * rms_mm.powi(2);
-    Ok(FittedSphere { centre_mm, radius_mm, covariance_mm2, inliers, share, rms_mm })
+    Ok(FittedSphere {
+        centre_mm,
+        radius_mm,
+        covariance_mm2: inverse * excess.powi(2),
+        inliers,
+        share,
+        rms_mm,
+    })
+}
+
+/// Distance of a point from a sphere and the standard deviation of that; `None` on a flank.
+fn off_sphere(point: &Point, (centre, radius): &Sphere) -> Option<(f64, f64)> {
+    let out = vector(point) - centre;
+    let facing = -point.along(&out.try_normalize(f64::MIN_POSITIVE)?);
+    (facing > LEAST_FACING).then(|| (out.norm() - radius, (facing * point.sigma_z_mm).max(f64::MIN_POSITIVE)))
+}
+
+/// The points that are no further from a sphere than `gate` makes of the standard deviation of their distance.
+fn on_sphere(points: &[Point], sphere: &Sphere, gate: impl Fn(f64) -> f64) -> Vec<Point> {
+    let near =
+        |point: &&Point| off_sphere(point, sphere).is_some_and(|(off, sigma)| off.abs() <= gate(sigma));
+    points.iter().filter(near).copied().collect()
 }
 
 /// Centre and radius in mm.
@@ -136,37 +188,37 @@ fn vector(point: &Point) -> Vector3<f64> {
     Vector3::from(point.mm)
 }
 
-/// The points on the surface through a subset of `few` that has the least median distance; `None` where no subset makes a surface.
-fn consensus<D: Fn(&Vector3<f64>) -> f64>(
+/// The surface through a subset of `few` points of which the given quantile of all distances is least, and that quantile; `None`
+/// where no subset makes a surface.
+fn consensus<S>(
     points: &[Point],
-    few: usize,
-    through: impl Fn(&[Vector3<f64>]) -> Option<D>,
-) -> Option<Result<Vec<Point>, FitError>> {
+    (few, quantile): (usize, f64),
+    through: impl Fn(&[Vector3<f64>]) -> Option<S>,
+    distance: impl Fn(&S, &Vector3<f64>) -> f64,
+) -> Result<Option<(S, f64)>, FitError> {
     if points.len() < LEAST_POINTS {
-        return Some(Err(FitError::TooFew(points.len())));
+        return Err(FitError::TooFew(points.len()));
     }
     let stride = points.len().div_ceil(JUDGES);
     let judges: Vec<Vector3<f64>> = points.iter().step_by(stride).map(vector).collect();
     let mut draw = Draw(0x9E37_79B9_7F4A_7C15);
-    let mut best: Option<(f64, D)> = None;
+    let mut best: Option<(S, f64)> = None;
     for _ in 0..SUBSETS {
         let subset: Vec<_> = (0..few).map(|_| judges[draw.below(judges.len())]).collect();
-        let Some(distance) = through(&subset) else { continue };
-        let mut distances: Vec<f64> = judges.iter().map(|point| distance(point).abs()).collect();
-        let middle = distances.len() / 2;
-        let median = *distances.select_nth_unstable_by(middle, f64::total_cmp).1;
-        if best.as_ref().is_none_or(|(least, _)| median < *least) {
-            best = Some((median, distance));
+        let Some(surface) = through(&subset) else { continue };
+        let mut distances: Vec<f64> = judges.iter().map(|point| distance(&surface, point).abs()).collect();
+        let rank = (distances.len() as f64 * quantile) as usize;
+        let reached = *distances.select_nth_unstable_by(rank, f64::total_cmp).1;
+        if best.as_ref().is_none_or(|(_, least)| reached < *least) {
+            best = Some((surface, reached));
         }
     }
-    let (median, distance) = best?;
-    // Few judges stretch the median of the best subset beyond that of the fit, never below.
-    Some(Ok(close(points, |point| distance(&vector(point)), median / MAD_OF_SIGMA)))
+    Ok(best)
 }
 
 /// Points within the gate, each at least as far as its own noise allows.
 fn close(points: &[Point], distance: impl Fn(&Point) -> f64, sigma_mm: f64) -> Vec<Point> {
-    let near = |point: &&Point| distance(point).abs() <= GATE * sigma_mm.max(point.sigma_mm);
+    let near = |point: &&Point| distance(point).abs() <= GATE * sigma_mm.max(point.sigma_z_mm);
     points.iter().filter(near).copied().collect()
 }
 
@@ -202,9 +254,8 @@ pub(super) fn scatter(points: &[Point], centroid: &Vector3<f64>) -> Matrix3<f64>
 }
 
 /// Sphere by linear least squares: `|x|^2 = 2 c.x + (r^2 - |c|^2)`, about the points' mean so that digits are kept.
-fn algebraic(points: impl Iterator<Item = Vector3<f64>> + Clone) -> Option<Sphere> {
-    let count = points.clone().count();
-    let mean = points.clone().sum::<Vector3<f64>>() / count as f64;
+fn algebraic(points: &[Vector3<f64>]) -> Option<Sphere> {
+    let mean = points.iter().sum::<Vector3<f64>>() / points.len() as f64;
     let (mut matrix, mut right) = (Matrix4::zeros(), Vector4::zeros());
     for point in points {
         let point = point - mean;
@@ -218,16 +269,16 @@ fn algebraic(points: impl Iterator<Item = Vector3<f64>> + Clone) -> Option<Spher
     (radius.is_finite() && radius < 1e6).then_some((centre + mean, radius))
 }
 
-/// One step on the geometric distances, and its normal matrix.
-fn gauss_newton(points: &[Point], (centre, radius): Sphere) -> Option<(Sphere, Matrix4<f64>)> {
+/// One step on the geometric distances, each weighted by its standard deviation, and the normal matrix before it.
+fn gauss_newton(points: &[Point], sphere: &Sphere) -> Option<(Sphere, Matrix4<f64>)> {
+    let (centre, radius) = sphere;
     let (mut matrix, mut right) = (Matrix4::zeros(), Vector4::zeros());
     for point in points {
-        let out = vector(point) - centre;
-        let length = out.norm();
-        let direction = out / length.max(f64::MIN_POSITIVE);
-        let row = Vector4::new(direction.x, direction.y, direction.z, 1.0);
+        let Some((off, sigma)) = off_sphere(point, sphere) else { continue };
+        let direction = (vector(point) - centre).normalize();
+        let row = Vector4::new(direction.x, direction.y, direction.z, 1.0) / sigma;
         matrix += row * row.transpose();
-        right += row * (length - radius);
+        right += row * (off / sigma);
     }
     let step = matrix.cholesky()?.solve(&right);
     let fit = (centre + step.xyz(), radius + step.w);
@@ -259,10 +310,10 @@ mod tests {
     }
 
     fn point(mm: [f64; 3]) -> Point {
-        Point { mm, sigma_mm: 0.05 }
+        Point { mm, sigma_z_mm: 0.05 }
     }
 
-    /// The front cap of a ball before a wall, with noise along z.
+    /// The front of a ball before a wall that has more than half of the points, with noise along the rays.
     fn ball(centre: [f64; 3], radius: f64, noise: f64, seed: u64) -> Vec<Point> {
         let mut random = StdRng::seed_from_u64(seed);
         let mut points = Vec::new();
@@ -275,7 +326,8 @@ mod tests {
                 } else {
                     centre[2] + 80.0
                 };
-                points.push(point([centre[0] + x, centre[1] + y, z + noisy(&mut random, noise)]));
+                let stretch = 1.0 + noisy(&mut random, noise) / z;
+                points.push(point([centre[0] + x, centre[1] + y, z].map(|value| stretch * value)));
             }
         }
         points
@@ -286,7 +338,7 @@ mod tests {
         let (centre, radius) = ([12.0, -7.0, 900.0], 25.0);
         let mut beyond = 0;
         for seed in 0..40 {
-            let fit = robust_sphere(&ball(centre, radius, 0.05, seed)).unwrap();
+            let fit = robust_sphere(&ball(centre, radius, 0.05, seed), 24.5).unwrap();
             let off = fit.centre_mm - Vector3::from(centre);
             for (axis, error) in [off.x, off.y, off.z, fit.radius_mm - radius].into_iter().enumerate() {
                 let sigma = fit.covariance_mm2[(axis, axis)].sqrt();
@@ -319,6 +371,6 @@ mod tests {
         assert_eq!(robust_plane(&few), Err(FitError::TooFew(99)));
         let same = vec![point([1.0, 2.0, 3.0]); 200];
         assert_eq!(robust_plane(&same), Err(FitError::NoSurface("plane")));
-        assert_eq!(robust_sphere(&same), Err(FitError::NoSurface("sphere")));
+        assert_eq!(robust_sphere(&same, 5.0), Err(FitError::NoSurface("sphere")));
     }
 }

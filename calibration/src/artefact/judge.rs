@@ -76,8 +76,11 @@ pub struct Accepted {
 /// Measures the artefact in a cloud. A check that cannot be made fails, with the reason.
 pub fn judge(artefact: &Artefact, points: &[PixelPoint]) -> Accepted {
     let planes: Vec<_> = artefact.planes.iter().map(|plane| on_plane(points, plane.region)).collect();
-    let balls: Vec<_> =
-        artefact.balls.iter().map(|ball| robust_sphere(&within(points, ball.region))).collect();
+    let balls: Vec<_> = artefact
+        .balls
+        .iter()
+        .map(|ball| robust_sphere(&within(points, ball.region), 0.5 * ball.diameter_mm))
+        .collect();
     let plane = |name: &str| find(&artefact.planes, &planes, |plane| plane.name == name);
     let ball = |name: &str| find(&artefact.balls, &balls, |ball| ball.name == name);
     let mut checks = Vec::new();
@@ -214,7 +217,7 @@ mod tests {
             .enumerate()
             .map(|(index, (x, y))| {
                 let (mm_x, mm_y) = (f64::from(x), f64::from(y));
-                let point = Point { mm: [mm_x, mm_y, depth(mm_x, mm_y) + noise(index)], sigma_mm: 0.03 };
+                let point = Point { mm: [mm_x, mm_y, depth(mm_x, mm_y) + noise(index)], sigma_z_mm: 0.03 };
                 PixelPoint { x, y, point }
             })
             .collect()
