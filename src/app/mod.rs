@@ -209,7 +209,9 @@ fn v4l2_options(settings: &Settings) -> v4l2::Options {
 /// Whether devices that the settings name come and go with plugs.
 pub fn is_real(settings: &Settings) -> bool {
     let drivers = [settings.raw.camera.driver, settings.raw.projector.driver];
-    drivers.iter().any(|driver| matches!(driver, DeviceDriver::Aravis | DeviceDriver::V4l2 | DeviceDriver::Window))
+    drivers
+        .iter()
+        .any(|driver| matches!(driver, DeviceDriver::Aravis | DeviceDriver::V4l2 | DeviceDriver::Window))
 }
 
 /// What the drivers stand on, with its version: `(name, version)`.

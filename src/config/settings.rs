@@ -166,7 +166,8 @@ fn check_ranges(raw: &Raw, faults: &mut Faults) {
         faults.push(("projector.driver".into(), format!("{} drives cameras only", driver.name())));
     }
     if !matches!(raw.camera.frame_size[..], [] | [1..=16_384, 1..=16_384]) {
-        let message = format!("{:?} is no size; give columns and rows, as [1280, 720], or []", raw.camera.frame_size);
+        let message =
+            format!("{:?} is no size; give columns and rows, as [1280, 720], or []", raw.camera.frame_size);
         faults.push(("camera.frame_size".into(), message));
     }
     if raw.camera.skip_frames > 100 {

@@ -12,7 +12,7 @@ use std::{
 use super::{
     Options, Taken,
     device::{Arrivals, Device},
-    kernel::{Node, Picture},
+    kernel::Node,
     listing::Place,
 };
 use crate::{
@@ -74,8 +74,7 @@ pub fn open(
 fn largest(node: &Node) -> (u32, u32) {
     let offered = node.formats();
     let known = super::format::Wire::ALL.into_iter().find(|wire| offered.contains(&wire.fourcc()));
-    let picture = known.and_then(|wire| node.set_picture(Picture::wish(wire.fourcc(), 16_384, 16_384)).ok());
-    picture.map_or((0, 0), |picture| (picture.width, picture.height))
+    known.and_then(|wire| node.natural_size(wire.fourcc()).ok()).unwrap_or_default()
 }
 
 /// Works until nobody can ask any more.

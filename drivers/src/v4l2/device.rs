@@ -26,9 +26,6 @@ use crate::{
 /// Buffers of a stream: each frame is taken as it comes.
 const BUFFERS: u32 = 6;
 
-/// Size that no camera has, of which a driver makes its largest.
-const LARGEST: u32 = 16_384;
-
 /// Time between frames of a camera that does not say.
 const SLOWEST_PERIOD_S: f64 = 0.2;
 
@@ -164,12 +161,15 @@ impl Device {
             ));
             return Ok(None);
         };
-        let (width, height) = self.options.frame_size.unwrap_or((LARGEST, LARGEST));
+        let (width, height) = match self.options.frame_size {
+            Some(size) => size,
+            None => node.natural_size(wire.fourcc())?,
+        };
         let picture = node.set_picture(Picture::wish(wire.fourcc(), width, height))?;
         if picture.fourcc != wire.fourcc() {
             differences.push(difference("format", code_name(wire.fourcc()), code_name(picture.fourcc)));
         }
-        if self.options.frame_size.is_some_and(|size| size != (picture.width, picture.height)) {
+        if (width, height) != (picture.width, picture.height) {
             let has = format!("{} x {}", picture.width, picture.height);
             differences.push(difference("frame_size", format!("{width} x {height}"), has));
         }

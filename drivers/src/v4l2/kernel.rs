@@ -130,6 +130,19 @@ struct Description {
     reserved: [u32; 3],
 }
 
+/// `struct v4l2_frmsizeenum`
+#[repr(C)]
+#[derive(Clone, Copy, Default)]
+struct FrameSize {
+    index: u32,
+    fourcc: u32,
+    /// 1 where the size stands alone.
+    kind: u32,
+    width: u32,
+    height: u32,
+    rest: [u32; 6],
+}
+
 /// `struct v4l2_streamparm`
 #[repr(C)]
 struct StreamParameters {
@@ -198,6 +211,7 @@ const _: () = assert!(
     size_of::<Capability>() == 104
         && size_of::<Format>() == 208
         && size_of::<Description>() == 64
+        && size_of::<FrameSize>() == 44
         && size_of::<StreamParameters>() == 204
         && size_of::<Request>() == 20
         && size_of::<Buffer>() == 88
@@ -300,6 +314,29 @@ impl Node {
         let mut format = Format { kind: VIDEO_CAPTURE, pad: 0, picture, rest: [0; 152] };
         self.call::<{ both::<Format>(5) }, _>(&mut format)?;
         Ok(format.picture)
+    }
+
+    /// The picture that it has.
+    fn picture(&self) -> io::Result<Picture> {
+        let mut format = Format { kind: VIDEO_CAPTURE, pad: 0, picture: Picture::default(), rest: [0; 152] };
+        self.call::<{ both::<Format>(4) }, _>(&mut format)?;
+        Ok(format.picture)
+    }
+
+    /// Columns and rows of the largest frames that are not scaled: of the sizes that a camera has the largest, and where it
+    /// makes any size, that of its source, which it has until another is set.
+    pub fn natural_size(&self, fourcc: u32) -> io::Result<(u32, u32)> {
+        let one = |index| {
+            let mut size = FrameSize { index, fourcc, ..FrameSize::default() };
+            self.call::<{ both::<FrameSize>(74) }, _>(&mut size).ok()?;
+            (size.kind == 1).then_some((size.width, size.height))
+        };
+        let largest =
+            (0..1024).map_while(one).max_by_key(|&(width, height)| u64::from(width) * u64::from(height));
+        match largest {
+            Some(size) => Ok(size),
+            None => self.picture().map(|picture| (picture.width, picture.height)),
+        }
     }
 
     /// Time between frames in seconds, where the driver knows it.
