@@ -6,15 +6,11 @@
 #![allow(clippy::unwrap_used, reason = "helpers of tests are tests")]
 
 use std::{
-    fs::{self, File},
-    io::Write,
-    path::Path,
-    process::Command,
-    sync::{
-        Arc, Mutex,
-        atomic::{AtomicBool, AtomicU64, Ordering},
-    },
-    thread::{self, JoinHandle},
+    fs,
+    io::Read,
+    path::{Path, PathBuf},
+    process::{Child, Command, Stdio},
+    sync::{Arc, Mutex},
     time::{Duration, Instant},
 };
 
@@ -29,7 +25,7 @@ use polscan_drivers::{
 const CAMERA: &str = "/dev/video0";
 const OUTPUT: &str = "/dev/video1";
 const SERIAL: &str = "platform:vivid-000";
-const WAIT: Duration = Duration::from_secs(10);
+const WAIT: Duration = Duration::from_secs(30);
 
 /// Runs `v4l2-ctl` on a node; what it says.
 fn ctl(node: &str, arguments: &[&str]) -> String {
@@ -69,12 +65,10 @@ fn timings(width: u32, height: u32) -> String {
     panic!("no timings of {width} x {height}: {list}");
 }
 
-/// What feeds the output while the camera runs.
+/// What feeds the output while the camera runs: another program, and the file of what it shows.
 struct Screen {
-    picture: Arc<Mutex<Arc<Vec<u8>>>>,
-    shown: Arc<AtomicU64>,
-    stop: Arc<AtomicBool>,
-    thread: Option<JoinHandle<()>>,
+    shows: Mutex<Option<Child>>,
+    file: PathBuf,
 }
 
 impl Screen {
@@ -84,44 +78,37 @@ impl Screen {
         ctl(OUTPUT, &["--set-dv-bt-timings", &timings]);
         ctl(OUTPUT, &["--set-fmt-video-out", &format!("width={width},height={height},pixelformat={fourcc}")]);
         ctl(CAMERA, &["--set-ctrl", "loop_video=1,osd_text_mode=2"]);
-        let picture = Arc::new(Mutex::new(Arc::new(Vec::new())));
-        let (shown, stop) = (Arc::new(AtomicU64::new(0)), Arc::new(AtomicBool::new(false)));
-        let thread = thread::spawn({
-            let (picture, shown, stop) = (picture.clone(), shown.clone(), stop.clone());
-            move || {
-                let mut output = File::options().write(true).open(OUTPUT).unwrap();
-                while !stop.load(Ordering::Relaxed) {
-                    let picture: Arc<Vec<u8>> = picture.lock().unwrap().clone();
-                    if picture.is_empty() {
-                        thread::sleep(Duration::from_millis(1));
-                    } else if output.write_all(&picture).is_ok() {
-                        shown.fetch_add(1, Ordering::Relaxed);
-                    } else {
-                        return;
-                    }
-                }
-            }
-        });
-        Self { picture, shown, stop, thread: Some(thread) }
+        Self { shows: Mutex::new(None), file: PathBuf::from("/tmp/picture") }
     }
 
-    /// Shows a picture, and returns when nothing else is on its way.
+    /// Shows a picture, and returns when it is on.
     fn show(&self, picture: Vec<u8>) {
-        *self.picture.lock().unwrap() = Arc::new(picture);
-        let before = self.shown.load(Ordering::Relaxed);
-        let start = Instant::now();
-        // More than the driver has buffers for.
-        while self.shown.load(Ordering::Relaxed) < before + 8 {
-            assert!(start.elapsed() < WAIT, "the output stands still");
-            thread::sleep(Duration::from_millis(1));
+        self.stop();
+        fs::write(&self.file, picture).unwrap();
+        let mut child = Command::new("v4l2-ctl")
+            .args(["-d", OUTPUT, "--stream-out-mmap", "--stream-loop", "--stream-count=1000000"])
+            .arg(format!("--stream-from={}", self.file.display()))
+            .stderr(Stdio::piped())
+            .spawn()
+            .unwrap();
+        // A sign for each frame that it has given, and more of them than there are buffers.
+        let mut signs = [0; 12];
+        child.stderr.as_mut().unwrap().read_exact(&mut signs).unwrap();
+        assert_eq!(signs, [b'>'; 12], "{}", String::from_utf8_lossy(&signs));
+        *self.shows.lock().unwrap() = Some(child);
+    }
+
+    fn stop(&self) {
+        if let Some(mut child) = self.shows.lock().unwrap().take() {
+            child.kill().unwrap();
+            child.wait().unwrap();
         }
     }
 }
 
 impl Drop for Screen {
     fn drop(&mut self) {
-        self.stop.store(true, Ordering::Relaxed);
-        drop(self.thread.take().unwrap().join());
+        self.stop();
     }
 }
 

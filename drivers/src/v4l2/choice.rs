@@ -202,7 +202,7 @@ mod tests {
             // The oracle goes over the list for each request anew.
             let mut expected = Vec::new();
             let mut from = 0;
-            let ordered = |n: usize| !shots[..n].iter().rfind(|shot| !shot.lost).is_some_and(|before| shots[n].stamp < before.stamp);
+            let ordered = |n: usize| shots[..n].iter().rfind(|shot| !shot.lost).is_none_or(|before| shots[n].stamp >= before.stamp);
             for (trigger, &at) in asked.iter().enumerate() {
                 let late = |&n: &usize| {
                     !shots[n].lost && ordered(n) && shots[n].stamp.saturating_sub(exposure + period) >= at
