@@ -2,6 +2,8 @@
 //!
 //! Only what is needed: one plane, memory of the driver's mapped into this process. A wait that ends without a frame
 //! leaves the stream as it is, a flagged buffer is handed out with its flags, and closing never panics.
+//!
+//! The file is long because the layouts by which its calls are safe stand beside them.
 
 use std::{
     fs::File,
