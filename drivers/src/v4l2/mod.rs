@@ -86,7 +86,8 @@ impl Taken {
     }
 
     fn new(node: PathBuf) -> Option<Self> {
-        Self::set().insert(node.clone()).then_some(Self(node))
+        // Made only where it is free: one that is dropped gives the camera back.
+        Self::set().insert(node.clone()).then(|| Self(node))
     }
 }
 
