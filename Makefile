@@ -1,5 +1,5 @@
 # Two commands are all that is needed: `make run` and `make test`. Both install what is missing first.
-.PHONY: run serve test captures foreign-plane faults soak kills service-figures fuzz accuracy api-fuzz systemd deb setup install ci
+.PHONY: run serve test captures foreign-plane faults soak kills service-figures fuzz accuracy api-fuzz systemd v4l2 deb setup install ci
 
 run: ## build, serve the simulated rig, scan it over REST, say where the results are
 	@scripts/install build
@@ -52,6 +52,10 @@ api-fuzz: ## ask a live service what its API document allows and what it does no
 systemd: ## as root: the package, installed in a container with a systemd of its own; about 3 minutes
 	@scripts/install systemd
 	@scripts/systemd-test
+
+v4l2: ## the driver of V4L2 cameras, on a kernel with a camera of its own in a virtual machine; about 2 minutes
+	@scripts/install v4l2
+	@scripts/v4l2-test
 
 deb: ## the Debian package, in target/debian
 	@scripts/install build

@@ -11,4 +11,5 @@ pub mod frame;
 pub mod projector;
 pub mod replay;
 pub mod sim;
+pub mod v4l2;
 pub mod window;

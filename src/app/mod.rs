@@ -9,6 +9,7 @@ use polscan_drivers::{
     error::DeviceError,
     projector::{Projector, ProjectorDriver},
     sim,
+    v4l2::{self, V4l2Cameras},
 };
 use thiserror::Error;
 
@@ -173,6 +174,7 @@ fn families(settings: &Settings) -> Result<Families, RigError> {
     let clock: Arc<dyn Clock> = Arc::new(MonotonicClock::start());
     let cameras: Option<Box<dyn CameraDriver>> = match settings.raw.camera.driver {
         DeviceDriver::Aravis => Some(Box::new(AravisCameras::new(aravis_options(settings), clock.clone()))),
+        DeviceDriver::V4l2 => Some(Box::new(V4l2Cameras::new(v4l2_options(settings), clock.clone()))),
         DeviceDriver::None | DeviceDriver::Sim | DeviceDriver::Replay | DeviceDriver::Window => None,
     };
     let projectors = window::projectors(settings, &clock);
@@ -192,10 +194,24 @@ fn aravis_options(settings: &Settings) -> aravis::Options {
     }
 }
 
+fn v4l2_options(settings: &Settings) -> v4l2::Options {
+    let camera = &settings.raw.camera;
+    v4l2::Options {
+        allow: camera.allow.clone(),
+        gain_raw: camera.gain_raw,
+        black_level: camera.black_level,
+        fixed_exposure_us: camera.fixed_exposure_us,
+        frame_size: camera.frame_size.first().copied().zip(camera.frame_size.get(1).copied()),
+        skip_frames: camera.skip_frames,
+    }
+}
+
 /// Whether devices that the settings name come and go with plugs.
 pub fn is_real(settings: &Settings) -> bool {
     let drivers = [settings.raw.camera.driver, settings.raw.projector.driver];
-    drivers.iter().any(|driver| matches!(driver, DeviceDriver::Aravis | DeviceDriver::Window))
+    drivers
+        .iter()
+        .any(|driver| matches!(driver, DeviceDriver::Aravis | DeviceDriver::V4l2 | DeviceDriver::Window))
 }
 
 /// What the drivers stand on, with its version: `(name, version)`.

@@ -448,8 +448,26 @@ mod tests {
         assert_eq!(settings.camera.trigger, polscan_drivers::camera::TriggerSource::Line0);
         // Without a format there is no frame, so that nothing but a mistake allows another.
         assert_eq!(load(&camera("[\"gama\", \"format\"]"), Vec::new()).unwrap_err(), ["camera.allow"; 2]);
-        let projector = "[projector]\ndriver = \"aravis\"";
-        assert_eq!(load(projector, Vec::new()).unwrap_err(), ["projector.driver"]);
+        for driver in ["aravis", "v4l2"] {
+            let projector = format!("[projector]\ndriver = \"{driver}\"");
+            assert_eq!(load(&projector, Vec::new()).unwrap_err(), ["projector.driver"]);
+        }
+    }
+
+    #[test]
+    fn what_only_a_camera_without_a_trigger_needs_is_checked() {
+        let camera = |keys: &str| load(&format!("[camera]\ndriver = \"v4l2\"\n{keys}\n"), Vec::new());
+        let settings = camera("frame_size = [1280, 720]\nfixed_exposure_us = 2000\nskip_frames = 0").unwrap();
+        assert_eq!(settings.raw.camera.frame_size, [1280, 720]);
+        assert_eq!(settings.raw.camera.fixed_exposure_us, Some(2000.0));
+        for (keys, fault) in [
+            ("frame_size = [1280]", "camera.frame_size"),
+            ("frame_size = [1280, 0]", "camera.frame_size"),
+            ("skip_frames = 101", "camera.skip_frames"),
+            ("fixed_exposure_us = 0", "camera.fixed_exposure_us"),
+        ] {
+            assert_eq!(camera(keys).unwrap_err(), [fault]);
+        }
     }
 
     #[test]

@@ -130,6 +130,8 @@ pub enum DeviceDriver {
     Replay,
     /// GenICam cameras by the Aravis library.
     Aravis,
+    /// Cameras of the kernel's video interface.
+    V4l2,
     /// A full-screen window; projectors only.
     Window,
 }
@@ -142,6 +144,7 @@ impl DeviceDriver {
             Self::Sim => "sim",
             Self::Replay => "replay",
             Self::Aravis => "aravis",
+            Self::V4l2 => "v4l2",
             Self::Window => "window",
         }
     }
@@ -195,6 +198,13 @@ pub struct Camera {
     pub black_level: Option<f64>,
     /// How USB cameras send.
     pub usb_mode: UsbMode,
+    /// Exposure time of a camera without a control for it, in microseconds.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub fixed_exposure_us: Option<f64>,
+    /// Columns and rows of the frames of a V4L2 camera, empty = the most.
+    pub frame_size: Vec<u32>,
+    /// Frames of a V4L2 camera to skip.
+    pub skip_frames: u32,
 }
 
 /// `region` of `[camera]`: all four keys or none.

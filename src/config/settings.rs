@@ -162,8 +162,19 @@ fn check_ranges(raw: &Raw, faults: &mut Faults) {
         let message = format!("`{name}` is none of {}", ALLOWABLE.join(", "));
         faults.push(("camera.allow".into(), message));
     }
-    if raw.projector.driver == DeviceDriver::Aravis {
-        faults.push(("projector.driver".into(), "aravis drives cameras only".into()));
+    if let driver @ (DeviceDriver::Aravis | DeviceDriver::V4l2) = raw.projector.driver {
+        faults.push(("projector.driver".into(), format!("{} drives cameras only", driver.name())));
+    }
+    if !matches!(raw.camera.frame_size[..], [] | [1..=16_384, 1..=16_384]) {
+        let message =
+            format!("{:?} is no size; give columns and rows, as [1280, 720], or []", raw.camera.frame_size);
+        faults.push(("camera.frame_size".into(), message));
+    }
+    if raw.camera.skip_frames > 100 {
+        faults.push(("camera.skip_frames".into(), format!("{} is more than 100", raw.camera.skip_frames)));
+    }
+    if raw.camera.fixed_exposure_us.is_some_and(|exposure| !(exposure > 0.0 && exposure.is_finite())) {
+        faults.push(("camera.fixed_exposure_us".into(), "an exposure takes more than 0 us".into()));
     }
     let size = &raw.projector.size;
     if !(size.is_empty() || size.len() == 2 && size.iter().all(|side| (1..=8192).contains(side))) {
