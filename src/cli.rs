@@ -57,6 +57,8 @@ enum Command {
     Openapi,
     /// List cameras and projectors, usable or not.
     Devices(ConfigArgs),
+    /// Say what is wrong with this machine for the configured rig, and what to do about it.
+    Doctor(ConfigArgs),
     /// Hold one picture on the projector for set-up, until an interrupt.
     Show(Show),
     /// Own the projector's full-screen window: for the service, which starts this by itself where it can.
@@ -338,6 +340,7 @@ fn dispatch(cli: &Cli) -> Result<u8, Failure> {
             commands::reindex(&layers(args, Vec::new()).load()?, cli.json)
         }
         Command::Openapi => Ok(commands::openapi()),
+        Command::Doctor(args) => commands::doctor(&layers(args, Vec::new()).load()?, cli.json),
         Command::Devices(args) => commands::devices(&layers(args, Vec::new()).load()?, cli.json),
         Command::Show(args) => {
             let shown =

@@ -7,6 +7,7 @@ pub mod cli;
 pub mod commands;
 pub mod compare;
 pub mod config;
+pub mod doctor;
 pub mod engine;
 mod evidence;
 pub mod measure;

@@ -1,6 +1,9 @@
 //! The only place that names concrete drivers: settings in, devices out.
 
-use std::{path::PathBuf, sync::Arc};
+use std::{
+    path::{Path, PathBuf},
+    sync::Arc,
+};
 
 use polscan_drivers::{
     aravis::{self, AravisCameras},
@@ -117,6 +120,11 @@ impl Beam {
         let projectors = projectors.ok_or(RigError::NotConfigured("projector"))?;
         Ok(Self { projector: projectors.open(named(&settings.raw.projector.serial))?, clock })
     }
+
+    /// What a person should know of the way to its display.
+    pub fn findings(&self) -> Vec<String> {
+        self.projector.info().display.as_ref().map(|display| display.findings.clone()).unwrap_or_default()
+    }
 }
 
 /// A serial number of the configuration, where an empty one stands for the only device there is.
@@ -212,6 +220,11 @@ pub fn is_real(settings: &Settings) -> bool {
     drivers
         .iter()
         .any(|driver| matches!(driver, DeviceDriver::Aravis | DeviceDriver::V4l2 | DeviceDriver::Window))
+}
+
+/// Number of USB3 Vision cameras that the kernel lists in its folder `devices`, whether or not they may be opened.
+pub fn usb_cameras(devices: &Path) -> usize {
+    aravis::usb_cameras(devices).len()
 }
 
 /// What the drivers stand on, with its version: `(name, version)`.

@@ -75,6 +75,12 @@ impl Library {
         Ok(Self { folder, _lock: lock })
     }
 
+    /// Whether a service has the store in `folder`; one that cannot be looked at counts as free.
+    pub fn is_in_use(folder: &Path) -> bool {
+        let lock = File::open(folder.join(LOCK));
+        lock.is_ok_and(|lock| matches!(lock.try_lock_shared(), Err(TryLockError::WouldBlock)))
+    }
+
     /// Where the store is.
     pub fn folder(&self) -> &Path {
         &self.folder

@@ -111,3 +111,28 @@ fn nobody_but_the_service_starts_the_window() {
     let text = String::from_utf8_lossy(&output.stderr);
     assert!(text.contains("give it --listen SOCKET"), "{text}");
 }
+
+#[test]
+fn the_doctor_says_what_the_window_found() {
+    let xvfb = Xvfb::start(320, 240);
+    let output = program(&xvfb, &["doctor", "--json"]).output().expect("the program");
+    let said: serde_json::Value = serde_json::from_slice(&output.stdout).expect("one object on stdout");
+    let of = |check: &str| -> Vec<&serde_json::Value> {
+        said["findings"]
+            .as_array()
+            .expect("findings")
+            .iter()
+            .filter(|found| found["check"] == check)
+            .collect()
+    };
+    assert_eq!(of("projector")[0]["level"], "ok", "{said:#}");
+    // A screen without a display tells no flips.
+    let display = of("display");
+    let guessed = |found: &&serde_json::Value| {
+        found["message"].as_str().is_some_and(|text| text.contains("only guessed"))
+    };
+    assert!(display.iter().any(|found| found["level"] == "warning" && guessed(found)), "{said:#}");
+    assert_eq!(of("camera")[0]["level"], "bad", "{said:#}");
+    assert_eq!(output.status.code(), Some(1));
+    eventually("the window is gone", || xvfb.screen().iter().all(|byte| *byte == 0));
+}

@@ -28,6 +28,7 @@ use library::Found;
 pub use library::version;
 pub use options::{Options, UsbMode};
 use recovery::{Action, Event};
+pub use usb::{UsbCamera, cameras as usb_cameras};
 
 use crate::{
     camera::{Camera, CameraDriver, Listing},

@@ -166,8 +166,10 @@ impl Watch {
         Ok((state == MapState::VIEWABLE).then_some(place))
     }
 
-    /// Forgets what was seen of pictures so far.
+    /// Forgets what was drawn so far, all that the server knows of it.
     pub fn forget(&mut self) -> Result<(), Fault> {
+        // An answer comes after all events before it: one that is still on its way would count as the next picture.
+        let _ = ask(self.x.get_input_focus(), "wait for the X server")?;
         while self.next()?.is_some() {}
         self.drawn = 0;
         Ok(())
