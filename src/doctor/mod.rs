@@ -1,6 +1,6 @@
 //! What is wrong with this machine for the configured rig, each with the next step.
 //!
-//! The machine itself is judged by files of its kernel and of udev ([`machine`]); the devices by what their drivers say of them.
+//! The machine itself is judged by files of its kernel and of udev; the devices by what their drivers say of them.
 
 mod machine;
 
