@@ -53,7 +53,7 @@ impl UsbCamera {
     }
 }
 
-/// All cameras below `devices`, which is [`SYSFS`] outside of tests.
+/// All cameras in a folder of the kernel that lists USB devices: `/sys/bus/usb/devices` outside of tests.
 pub fn cameras(devices: &Path) -> Vec<UsbCamera> {
     let names = |folder: &Path| -> Vec<PathBuf> {
         let entries = fs::read_dir(folder).into_iter().flatten();
