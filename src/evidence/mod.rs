@@ -140,7 +140,8 @@ impl Look {
         let rests = self.one_sided >= ONE_SIDED && spread > ONE_REST && strength < ABSURD;
         // Another picture is off by the whole modulation; by more where the references are other pictures, too.
         let is_another = !rests && (strength > ANOTHER[1] || (strength >= ANOTHER[0] && spread <= ONE_REST));
-        if let Some(row) = self.torn_at.filter(|_| is_another) {
+        // Beside a picture of fine stripes, blurred to a part of their modulation, a tear leaves less.
+        if let Some(row) = self.torn_at.filter(|_| is_another || strength >= STALE_SHARE) {
             return Cause::Torn(row);
         }
         if self.disturbed() < WHOLE_FRAME {

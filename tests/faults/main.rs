@@ -3,8 +3,9 @@
 //! Each fault is judged twice: by the live scan, which may take frames again, and by `polscan decode` of what a recorder
 //! without any checks makes of the same rig: pictures in the order in which they arrived, without receipts or stamps.
 //!
-//! `POLSCAN_FAULTS_SEEDS` (20), `POLSCAN_FAULTS_SCALE` (3: a third of the paper's rig along each side; 1: all of it),
-//! `POLSCAN_FAULTS_ONLY` (part of a fault's name), `POLSCAN_FAULTS_OUT` (a file for the table, written after each seed).
+//! `POLSCAN_FAULTS_SEEDS` (20), `POLSCAN_FAULTS_FIRST` (the first of them, 1), `POLSCAN_FAULTS_SCALE` (3: a third of the paper's rig along each side; 1: all of it),
+//! `POLSCAN_FAULTS_ONLY` (part of a fault's name), `POLSCAN_FAULTS_OUT` (a file for the table, written after each seed),
+//! `POLSCAN_FAULTS_REPORTS` (a folder for the reports of scans whose fault was named wrong).
 
 mod cases;
 mod recorder;
@@ -17,6 +18,7 @@ use std::{
     env,
     fmt::Write as _,
     fs,
+    ops::Range,
     sync::{
         Mutex, PoisonError,
         atomic::{AtomicUsize, Ordering},
@@ -40,6 +42,7 @@ struct Found {
     verdict: String,
     wrong: Option<f64>,
     all: Vec<String>,
+    report: Value,
 }
 
 /// All runs of one fault in one way.
@@ -58,17 +61,19 @@ fn every_fault_is_named_and_none_ends_in_a_wrong_cloud_called_ok() {
     let number = |name: &str, default: f64| {
         env::var(name).map_or(default, |text| text.parse().unwrap_or_else(|_| panic!("{name}: a number")))
     };
-    let seeds = number("POLSCAN_FAULTS_SEEDS", 20.0) as u64;
+    let first = number("POLSCAN_FAULTS_FIRST", 1.0) as u64;
+    let seeds = first..first + number("POLSCAN_FAULTS_SEEDS", 20.0) as u64;
     let scale = number("POLSCAN_FAULTS_SCALE", 3.0);
     let only = env::var("POLSCAN_FAULTS_ONLY").unwrap_or_default();
     let cases: Vec<Case> = cases::all().into_iter().filter(|case| case.name.contains(&only)).collect();
     let out = env::var("POLSCAN_FAULTS_OUT").ok();
-    let rows = run_all(&cases, seeds, scale, |rows, seeds| {
+    let rows = run_all(&cases, &seeds, scale, |rows, done| {
         if let Some(path) = &out {
-            fs::write(path, table(rows, seeds, scale)).unwrap_or_else(|error| panic!("{path}: {error}"));
+            fs::write(path, table(rows, &(first..done), scale))
+                .unwrap_or_else(|error| panic!("{path}: {error}"));
         }
     });
-    println!("{}", table(&rows, seeds, scale));
+    println!("{}", table(&rows, &seeds, scale));
     let mut failures = Vec::new();
     for (case, tallies) in &rows {
         for (way, tally) in ["live", "alone"].iter().zip(tallies) {
@@ -88,10 +93,10 @@ fn every_fault_is_named_and_none_ends_in_a_wrong_cloud_called_ok() {
 type Row<'a> = (&'a Case, [Tally; 2]);
 
 /// All faults with one seed after the other, as many at once as the machine has processors; `report` sees the rows each time
-/// that all scans of a seed and of those before it have ended.
+/// that as many scans as there are faults have ended, and the seed that is next then.
 fn run_all<'a>(
     cases: &'a [Case],
-    seeds: u64,
+    seeds: &Range<u64>,
     scale: f64,
     report: impl Fn(&[Row<'a>], u64) + Sync,
 ) -> Vec<Row<'a>> {
@@ -100,8 +105,8 @@ fn run_all<'a>(
     let work = || {
         loop {
             let job = next.fetch_add(1, Ordering::Relaxed);
-            let (seed, index) = ((job / cases.len()) as u64 + 1, job % cases.len());
-            if seed > seeds {
+            let (seed, index) = (seeds.start + (job / cases.len()) as u64, job % cases.len());
+            if seed >= seeds.end {
                 return;
             }
             let case = &cases[index];
@@ -115,11 +120,14 @@ fn run_all<'a>(
                     "{} seed {seed} {way}: {} ({}), wrong {:?}, all {:?}",
                     case.name, found.headline, found.verdict, found.wrong, found.all
                 );
+                if !expected.contains(&found.headline.as_str()) {
+                    keep(&format!("{} seed {seed} {way}", case.name), &found.report);
+                }
                 tally.add(&found, expected);
             }
             *ended += 1;
             if *ended % cases.len() == 0 {
-                report(rows, (*ended / cases.len()) as u64);
+                report(rows, seeds.start + (*ended / cases.len()) as u64);
             }
         }
     };
@@ -165,7 +173,17 @@ fn found(report: &Value) -> Found {
     let verdict = report["verdict"].as_str().expect("a verdict").to_owned();
     let headline = reasons.first().or(again.first()).cloned().unwrap_or_else(|| verdict.clone());
     let all = reasons.iter().cloned().chain(again.iter().map(|slug| format!("again: {slug}"))).collect();
-    Found { headline, verdict, wrong: report["truth"]["wrong_code_rate"].as_f64(), all }
+    let wrong = report["truth"]["wrong_code_rate"].as_f64();
+    Found { headline, verdict, wrong, all, report: report.clone() }
+}
+
+/// Keeps a report for somebody who wants to know why its fault was named wrong.
+fn keep(name: &str, report: &Value) {
+    if let Ok(folder) = env::var("POLSCAN_FAULTS_REPORTS") {
+        fs::create_dir_all(&folder).unwrap_or_else(|error| panic!("{folder}: {error}"));
+        let path = format!("{folder}/{name}.json");
+        fs::write(&path, format!("{report:#}")).unwrap_or_else(|error| panic!("{path}: {error}"));
+    }
 }
 
 impl Tally {
@@ -185,8 +203,9 @@ impl Tally {
     }
 }
 
-fn table(rows: &[Row], seeds: u64, scale: f64) -> String {
-    let mut text = format!("Seeds 1 to {seeds}, the paper's rig divided by {scale}.\n\n");
+fn table(rows: &[Row], seeds: &Range<u64>, scale: f64) -> String {
+    let mut text =
+        format!("Seeds {} to {}, the paper's rig divided by {scale}.\n\n", seeds.start, seeds.end - 1);
     text.push_str("| fault | judged by | named right | called | most wrong in `ok` | in `degraded` |\n");
     text.push_str("|---|---|---|---|---|---|\n");
     for (case, tallies) in rows {

@@ -31,6 +31,8 @@ const FINE_RANKS: u8 = 3;
 const LONE_OUTLIERS: f64 = 0.2;
 /// Outliers of a fine pair that is sound beside it.
 const SOUND_OUTLIERS: f64 = 0.05;
+/// Difference of the gains of P and Q, as a share of the larger, from which on it is the light and not the response.
+const UNEQUAL: f64 = 0.5;
 /// Shift and spread of a pair that call for a closer look, in units of noise that was measured: where it was estimated,
 /// from 8-bit frames in particular, sound pairs reach them.
 const LOOK_SHIFT: f64 = 0.5;
@@ -178,17 +180,24 @@ pub fn diagnose(decoded: &Decoded, frames: Option<Frames>) -> Vec<Reason> {
         let look = frames.and_then(|frames| frames.look(view.pair.axis, view.pair.bit, false));
         Case { view, look }
     });
+    // A lamp that dips in between fine pairs: unlike any response, it changes the frames of a pair unequally.
+    let lit_otherwise: Vec<Case> = if lone_fine.is_none() {
+        frames.map_or(Vec::new(), |frames| flickering(&fine, frames))
+    } else {
+        Vec::new()
+    };
     let light = |case: &Case| {
         case.look.as_ref().is_some_and(|look| matches!(look.cause(), Cause::Lamp | Cause::Room))
     };
     if lone_fine.as_ref().is_some_and(light) {
         shifted.extend(lone_fine.take());
     }
+    shifted.extend(lit_otherwise);
 
     let mut reasons = Vec::new();
     reasons.extend(light::brightness(decoded, frames, &coarse, &shifted));
     if !disturbed.is_empty() {
-        reasons.push(disturbed::disturbance(&disturbed, coarse.len(), frames));
+        reasons.push(disturbed::disturbance(&disturbed, &fine, coarse.len(), frames));
         // With pairs disturbed, what happens at edges and in fine stripes is no evidence of its own; nor where pairs are
         // compared with each other for want of references.
         let compared = frames.is_some_and(|frames| !frames.has_references());
@@ -257,6 +266,28 @@ fn lone<'a>(fine: &[View<'a>]) -> Option<View<'a>> {
     // Of one axis alone the finest pair may be the only one that crosstalk spoils so much.
     let comparable = fine.iter().any(|view| view.pair.axis != bad.pair.axis) || bad.rank > 0;
     (comparable && others.all(|view| view.outliers() < SOUND_OUTLIERS)).then_some(bad)
+}
+
+/// Two fine pairs, the others being sound, between which the light was another for a frame or two.
+fn flickering<'a>(fine: &[View<'a>], frames: Frames) -> Vec<Case<'a>> {
+    let bad: Vec<View> = fine.iter().filter(|view| view.outliers() > LONE_OUTLIERS).copied().collect();
+    let others = fine.iter().filter(|view| view.outliers() <= LONE_OUTLIERS);
+    if bad.len() != 2
+        || others.clone().count() == 0
+        || others.into_iter().any(|view| view.outliers() > SOUND_OUTLIERS)
+    {
+        return Vec::new();
+    }
+    let cases: Vec<Case> = bad
+        .into_iter()
+        .map(|view| Case { view, look: frames.look(view.pair.axis, view.pair.bit, false) })
+        .collect();
+    let unequal = |case: &Case| {
+        case.look.as_ref().is_some_and(|look| {
+            look.cause() == Cause::Lamp && (look.gains[0] - look.gains[1]).abs() > UNEQUAL * look.change.abs()
+        })
+    };
+    if cases.iter().all(unequal) { cases } else { Vec::new() }
 }
 
 /// A response that is not linear shows at stripe edges, or in the finest stripes, which have nothing else.

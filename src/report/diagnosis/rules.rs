@@ -114,10 +114,11 @@ fn from_pixels(input: &ReportInput, decoded: &Decoded, pixels: &PixelCounts) -> 
     let wrong = reasons.iter().any(is_wrong);
     if !wrong || !reasons.iter().any(|reason| reason.diagnosis == Diagnosis::PolarizationInverted) {
         let found = wrong_order(input, decoded, pixels, !wrong);
-        let moved = reasons.iter_mut().find(|reason| reason.diagnosis == Diagnosis::Motion);
+        let changed = [Diagnosis::Motion, Diagnosis::AmbientDrift];
+        let moved = reasons.iter_mut().find(|reason| changed.contains(&reason.diagnosis));
         match (found, moved) {
-            // Pairs that were exchanged add up all the same: where something moved, it is that which put edges, or words,
-            // where they cannot be.
+            // Pairs that were exchanged add up all the same: where something moved, or a light was switched on between the
+            // frames of a pair, it is that which put edges, or words, where they cannot be.
             (Some(found), Some(moved)) => {
                 moved.severity = Verdict::Failed;
                 moved.evidence["order"] = found.evidence;

@@ -3,8 +3,9 @@
 use polscan_patterns::Role;
 use serde_json::{Value, json};
 
-use super::{Case, all_evidence, names};
+use super::{Case, View, all_evidence, names};
 use crate::{
+    decode::PairResidual,
     evidence::{Cause, Frames, Look, STALE_SHARE, WHOLE_FRAME},
     report::{
         diagnosis::{Diagnosis, Reason},
@@ -26,8 +27,14 @@ const FEW_PAIRS: f64 = 0.15;
 const SAME_PIXELS: f64 = 0.4;
 
 /// Pixels that do not fit together on flat areas.
-pub(super) fn disturbance(disturbed: &[Case], coarse: usize, frames: Option<Frames>) -> Reason {
-    if let Some(reason) = frames.and_then(|frames| arrival(disturbed, frames)) {
+/// `fine` are the fine pairs, which only tell where a lost frame was.
+pub(super) fn disturbance(
+    disturbed: &[Case],
+    fine: &[View],
+    coarse: usize,
+    frames: Option<Frames>,
+) -> Reason {
+    if let Some(reason) = frames.and_then(|frames| arrival(disturbed, fine, frames)) {
         return reason;
     }
     if disturbed.len() as f64 <= (FEW_PAIRS * coarse as f64).max(2.0) {
@@ -86,22 +93,29 @@ pub(super) fn unsettled(disturbed: &[Case], rest: f64) -> Reason {
 
 /// Frames that fit when those of the place before or behind are taken for them: one was lost, or came twice. Both fit at
 /// once, as the pair before and the pair behind; what stands in the places of the last references tells which it is.
-fn arrival(disturbed: &[Case], frames: Frames) -> Option<Reason> {
+fn arrival(disturbed: &[Case], fine: &[View], frames: Frames) -> Option<Reason> {
+    let place = |pair: &PairResidual| {
+        let role = Role::Code { axis: pair.axis, bit: pair.bit, inverse: false };
+        frames.all.iter().position(|(other, _)| *other == role)
+    };
+    // A lost frame displaces all that come behind it, the fine pairs as well.
+    let first = disturbed.iter().filter_map(|case| place(case.view.pair)).min()?;
+    let behind = fine.iter().filter(|view| place(view.pair).is_some_and(|place| place > first));
+    let coarse = disturbed.iter().map(|case| (case.view.pair, true));
+    let pairs: Vec<_> = coarse.chain(behind.map(|view| (view.pair, false))).collect();
     let fits = |from: isize| {
-        let sound = disturbed.iter().filter(|case| {
-            let pair = case.view.pair;
-            let role = Role::Code { axis: pair.axis, bit: pair.bit, inverse: false };
-            let place = frames.all.iter().position(|(other, _)| *other == role);
+        let sound = pairs.iter().filter(|(pair, flat_only)| {
+            let place = place(pair);
             let planes = place.and_then(|place| {
                 let first = place.checked_add_signed(from)?;
                 Some([frames.all.get(first)?.1, frames.all.get(first + 1)?.1])
             });
-            let look = planes.and_then(|planes| frames.look_at(planes, true));
+            let look = planes.and_then(|planes| frames.look_at(planes, *flat_only));
             look.is_some_and(|look| look.unexplained < SOUND)
         });
-        sound.count() as f64 >= FITTING * disturbed.len() as f64
+        sound.count() as f64 >= FITTING * pairs.len() as f64
     };
-    if disturbed.len() < LEAST_FITTING || !(fits(-1) || fits(1)) {
+    if pairs.len() < LEAST_FITTING || !(fits(-1) || fits(1)) {
         return None;
     }
     let [bright, dark] = frames.all_references()?;

@@ -7,7 +7,7 @@ use super::{Case, View, all_evidence, names};
 use crate::{
     decode::Decoded,
     evidence::{
-        Frames,
+        CHANGE, Frames,
         exposure::{self, Exposure, Gauge},
     },
     report::{
@@ -77,6 +77,10 @@ fn is_to_and_fro(coarse: &[View], shifted: &[Case], drifted: bool) -> bool {
     }
     let (low, high) = changes.iter().fold((f64::MAX, f64::MIN), |(l, h), &c| (l.min(c), h.max(c)));
     let range = high - low;
+    // Pairs that agree with each other went nowhere: it is the references that were taken in other light.
+    if range < STEADY {
+        return false;
+    }
     let travel: f64 = changes.windows(2).map(|two| (two[1] - two[0]).abs()).sum();
     let middle = statistics::median(&mut changes.clone()).unwrap_or(0.0);
     let is_odd = |change: &&f64| (*change - middle).abs() > 0.5 * range;
@@ -96,6 +100,8 @@ const DRIFT: f64 = 0.02;
 const TRAVEL: f64 = 2.5;
 /// Steps from frame to frame that automatic exposure is told by.
 const LEAST_STEPS: usize = 8;
+/// Range of the changes of all frames below which they are one and the same.
+const STEADY: f64 = 0.5 * CHANGE;
 /// Share of the frames that are few.
 const FEW_FRAMES: f64 = 0.15;
 /// Share of the drift that the modulation must take part in for lamp or exposure to be its cause.
