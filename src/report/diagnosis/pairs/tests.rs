@@ -411,3 +411,33 @@ fn exchanged_frames_are_swapped() {
         assert_eq!(scanned(Mode::Pse, swapped), [(Diagnosis::SwappedFrames, FAILED)], "{bit}");
     }
 }
+
+#[test]
+fn a_frame_lost_among_the_last_pairs_is_told_by_the_fine_ones_behind_it() {
+    let lost = |scan: &mut Scan| {
+        for at in scan.at(Axis::Row, 3, false)..scan.frames.len() - 1 {
+            scan.frames[at].1 = scan.frames[at + 1].1.clone();
+        }
+    };
+    assert_eq!(scanned(Mode::Pse, lost), [(Diagnosis::LostFrame, FAILED)]);
+}
+
+#[test]
+fn a_lamp_that_dips_between_two_fine_pairs_is_flicker() {
+    let dip = |scan: &mut Scan| {
+        let at = scan.at(Axis::Column, 5, true);
+        scan.scale(at, 0.8, ALL);
+        scan.scale(at + 1, 0.8, ALL);
+    };
+    assert_eq!(scanned(Mode::Pse, dip), [(Diagnosis::Flicker, DEGRADED)]);
+}
+
+#[test]
+fn a_room_light_switched_on_behind_all_coarse_pairs_is_no_flicker() {
+    let switched_on = |scan: &mut Scan| {
+        for at in scan.at(Axis::Row, 4, false)..scan.frames.len() {
+            scan.frames[at].1.iter_mut().for_each(|value| *value = (*value + 60).min(4095));
+        }
+    };
+    assert_eq!(scanned(Mode::Pse, switched_on), [(Diagnosis::AmbientDrift, DEGRADED)]);
+}
