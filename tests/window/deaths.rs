@@ -6,27 +6,12 @@ use std::{
 };
 
 use polscan_drivers::error::DeviceError;
-use rustix::process::{Pid, Signal, kill_process};
+use rustix::process::{Signal, kill_process};
 
 use crate::{
     open, options, try_open, uniform,
-    xvfb::{Xvfb, eventually},
+    xvfb::{Xvfb, eventually, window_process},
 };
-
-/// The process with the window on `xvfb`: the one whose surroundings name its display.
-fn window_process(xvfb: &Xvfb) -> Pid {
-    let wanted = format!("DISPLAY={}", xvfb.display());
-    let is_ours = |pid: i32| {
-        let read = |name: &str| fs::read_to_string(format!("/proc/{pid}/{name}")).unwrap_or_default();
-        read("cmdline").split('\0').nth(1) == Some("projector")
-            && read("environ").split('\0').any(|variable| variable == wanted)
-    };
-    let pids = fs::read_dir("/proc").expect("processes").flatten();
-    let pids = pids.filter_map(|entry| entry.file_name().to_str()?.parse::<i32>().ok());
-    let found: Vec<i32> = pids.filter(|pid| is_ours(*pid)).collect();
-    let [pid] = found[..] else { panic!("one process with a window on {wanted}: {found:?}") };
-    Pid::from_raw(pid).expect("a process")
-}
 
 #[test]
 fn a_killed_window_is_opened_again_with_the_next_picture() {
