@@ -77,8 +77,8 @@ fn is_inside(truth: &Truth, pixel: usize) -> bool {
         && inner(y, truth.height)
         && (y - REACH..=y + REACH).all(|row| {
             let around = row * truth.width + x - REACH..=row * truth.width + x + REACH;
-            around.into_iter().all(|near| {
-                truth.object[near] == truth.object[pixel] && truth.column[near].is_finite()
-            })
+            around
+                .into_iter()
+                .all(|near| truth.object[near] == truth.object[pixel] && truth.column[near].is_finite())
         })
 }

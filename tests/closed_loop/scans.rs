@@ -38,7 +38,8 @@ fn compare(scale: f64, frames_hz: f32) {
     assert_eq!(display["receipts"], "guessed");
     check_receipts(&file("manifest.json").json());
 
-    let run = polscan(&["scan", "--config", text(&stage.twin.config()), "--out", text(&stage.twin.path("twin"))]);
+    let run =
+        polscan(&["scan", "--config", text(&stage.twin.config()), "--out", text(&stage.twin.path("twin"))]);
     run.expect(0);
     let truth = stage.truth();
     let looped = plates(&truth, &file("maps.npz").body, &file("cloud.ply").body);
@@ -64,9 +65,9 @@ fn check_receipts(manifest: &Value) {
     for (index, frame) in frames.iter().enumerate() {
         let receipt = &frame["receipt"];
         assert_eq!((&receipt["slide"], &receipt["method"]), (&index.into(), &"guessed".into()), "{frame}");
-        let flipped = receipt["flipped"].as_u64().expect("a time");
+        let flipped = receipt["flipped_ns"].as_u64().expect("a time");
         assert!(flipped > before, "{frame}");
-        assert!(frame["stamp"]["exposure_start"].as_u64() > Some(flipped), "{frame}");
+        assert!(frame["stamp"]["exposure_start_ns"].as_u64() > Some(flipped), "{frame}");
         before = flipped;
     }
 }
