@@ -105,6 +105,8 @@ pub enum News {
         /// Why and what to do.
         message: String,
     },
+    /// The projector was opened again without any failure.
+    Projector(Box<ProjectorInfo>),
     /// The first pattern is due.
     Started {
         /// Scan.
@@ -164,6 +166,8 @@ pub struct Shared {
 struct Open {
     rig: Rig,
     prepared: Prepared,
+    /// What everybody knows of the projector.
+    told: ProjectorInfo,
 }
 
 /// Runs until all senders of `commands` are gone.
@@ -194,12 +198,14 @@ pub fn run(shared: &Shared, commands: &Receiver<Command>) {
         let broken = match (commands.recv_timeout(wait), &mut open) {
             (Err(RecvTimeoutError::Disconnected), _) => break,
             (Err(RecvTimeoutError::Timeout), open) => {
-                open.as_ref().and_then(|rig| rig.rig.camera.alive().err()).map(|error| error.to_string())
+                open.as_mut().and_then(|rig| rig.alive().err()).map(|error| error.to_string())
             }
             (Ok(Command::Scan(job)), Some(rig)) => rig.scan(shared, *job),
             (Ok(Command::Show(shown, reply)), Some(rig)) => {
-                let _ = reply.send(rig.show(shared, shown));
-                None
+                let held = rig.show(shared, shown);
+                let broken = held.as_ref().err().and_then(broken_by);
+                let _ = reply.send(held);
+                broken
             }
             (Ok(Command::Preview), Some(rig)) => {
                 let broken = rig.preview(shared).err().map(|error| error.to_string());
@@ -243,6 +249,14 @@ fn guarded(open: impl FnOnce() -> Result<Open, Failure>) -> Result<Open, String>
     }
 }
 
+/// What a failure says of a device that is broken. One that refuses a setting is well.
+fn broken_by(failure: &Failure) -> Option<String> {
+    match failure {
+        Failure::Device { source, .. } if !source.is_refusal() => Some(failure.chain()),
+        _ => None,
+    }
+}
+
 /// What a panic said.
 pub fn said(panic: &(dyn std::any::Any + Send)) -> String {
     let text = panic.downcast_ref::<&str>().map(|text| (*text).to_owned());
@@ -275,7 +289,23 @@ impl Open {
     fn new(shared: &Shared) -> Result<Self, Failure> {
         let mut rig = Rig::open(&shared.settings).map_err(rig_failure)?;
         let prepared = Prepared::new(&shared.settings, shared.settings.mode, None, &mut rig)?;
-        Ok(Self { rig, prepared })
+        let told = rig.projector.info().clone();
+        Ok(Self { rig, prepared, told })
+    }
+
+    /// Whether camera and projector are still there.
+    fn alive(&mut self) -> Result<(), DeviceError> {
+        self.rig.camera.alive()?;
+        self.rig.projector.alive()
+    }
+
+    /// Tells what the projector is now where it was opened again meanwhile.
+    fn tell_projector(&mut self, shared: &Shared) {
+        let projector = self.rig.projector.info();
+        if *projector != self.told {
+            self.told = projector.clone();
+            shared.tell(News::Projector(Box::new(projector.clone())));
+        }
     }
 
     fn news(&self) -> News {
@@ -304,11 +334,7 @@ impl Open {
                 (News::Taken(Box::new(captured)), broken)
             }
             Ok(Err(failure)) => {
-                // A device that refuses a setting is well.
-                let broken = match &failure {
-                    Failure::Device { source, .. } if !source.is_refusal() => Some(failure.chain()),
-                    _ => None,
-                };
+                let broken = broken_by(&failure);
                 (News::Refused { id, failure }, broken)
             }
             Err(panic) => {
@@ -363,13 +389,16 @@ impl Open {
             }
         };
         let taken = scan.capture(&mut self.rig, &mut progress, &job.cancel);
+        self.tell_projector(shared);
         shared.metrics.stream(&self.rig.camera.info().serial, taken.statistics());
         Ok(Captured { scan, taken, writer, label: job.label })
     }
 
     fn show(&mut self, shared: &Shared, shown: Shown) -> Result<(), Failure> {
         let Rig { projector, clock, .. } = &mut self.rig;
-        hold(shown, &shared.settings, projector.as_mut(), clock.as_ref())
+        let held = hold(shown, &shared.settings, projector.as_mut(), clock.as_ref());
+        self.tell_projector(shared);
+        held
     }
 
     fn preview(&mut self, shared: &Shared) -> Result<(), DeviceError> {

@@ -8,6 +8,7 @@ mod client;
 #[path = "../service/daemon.rs"]
 #[allow(dead_code, reason = "the service's own suite needs more of it")]
 mod daemon;
+mod deaths;
 mod measure;
 #[path = "../end_to_end/rig.rs"]
 #[allow(dead_code, reason = "the other suite needs more of it")]

@@ -2,7 +2,7 @@
 
 use std::{
     path::{Path, PathBuf},
-    sync::Arc,
+    sync::{Arc, Mutex, MutexGuard},
     time::Duration,
 };
 
@@ -133,6 +133,8 @@ pub struct Stage {
     pub twin: Rig,
     settings: Settings,
     rig: sim::Rig,
+    clock: Arc<VirtualClock>,
+    running: Arc<Mutex<()>>,
     frames_hz: f32,
 }
 
@@ -146,20 +148,28 @@ impl Stage {
         let xvfb = Xvfb::start(width, height);
         let clock = Arc::new(VirtualClock::default());
         let rig = sim::Rig::new(description, scene, clock.clone()).expect("a twin");
-        let mut stage = Self { xvfb, camera: None, twin, settings, rig, frames_hz };
-        stage.plug(clock);
+        let mut stage = Self { xvfb, camera: None, twin, settings, rig, clock, running: Arc::default(), frames_hz };
+        stage.plug();
         stage
     }
 
-    fn plug(&mut self, clock: Arc<VirtualClock>) {
+    /// Stops the camera in the middle of its next exposure until what is returned is dropped: one thread does all that
+    /// it does, so that it neither sends nor answers.
+    pub fn stop_camera(&self) -> MutexGuard<'_, ()> {
+        self.running.lock().expect("nothing panics with it")
+    }
+
+    fn plug(&mut self) {
         let (description, _) = self.settings.sim.as_ref().expect("a twin");
         let [width, height] = description.projector.size;
-        let mut optics = Optics::new(&self.rig, clock, &self.settings.camera);
+        let mut optics = Optics::new(&self.rig, self.clock.clone(), &self.settings.camera);
         let pixels = (width * height) as usize;
         let mut screen = Screen { display: self.xvfb.display(), connection: None, pixels };
         let genicam: PathBuf =
             [env!("CARGO_MANIFEST_DIR"), "drivers", "tests", "data", "blackfly.xml"].iter().collect();
+        let running = self.running.clone();
         let paint = move |exposure: Exposure, bytes: &mut [u8]| {
+            let _stopped_meanwhile = running.lock().expect("nothing panics with it");
             assert_eq!(exposure.format, MONO12P);
             pack(&optics.expose(screen.now(), &exposure), bytes);
         };
@@ -178,11 +188,6 @@ impl Stage {
     /// What the camera truly sees.
     pub fn truth(&self) -> sim::Truth {
         self.rig.truth_of(None)
-    }
-
-    /// The camera.
-    pub fn camera(&self) -> &Fake {
-        self.camera.as_ref().expect("it is plugged in")
     }
 
     /// The service, started, which knows of the twin only what a calibration says.

@@ -17,6 +17,7 @@ impl Owner {
                 self.rig_event();
             }
             rig::News::Down { message } => self.rig_down(message),
+            rig::News::Projector(projector) => self.rig.projector = Some(*projector),
             rig::News::Started { id, frames } => {
                 self.edit(&id, |record| record.progress.of = frames);
                 self.progress(&id);
