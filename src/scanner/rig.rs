@@ -221,9 +221,8 @@ pub fn run(shared: &Shared, commands: &Receiver<Command>) {
             tracing::warn!(message, "the rig is opened again");
             // Closed first: a device cannot be opened twice.
             open = None;
-            shared.up(false);
+            shared.down(&message);
             shared.metrics.camera_reconnects.inc();
-            shared.tell(News::Down { message });
             next_try = Instant::now() + BACKOFF[0];
         }
     }
@@ -277,6 +276,11 @@ impl Shared {
     fn tell(&self, news: News) {
         // Whoever does not listen any more is ending the process.
         let _ = self.news.send(Message::Rig(news));
+    }
+
+    fn down(&self, message: &str) {
+        self.up(false);
+        self.tell(News::Down { message: message.to_owned() });
     }
 
     fn up(&self, up: bool) {
@@ -342,6 +346,10 @@ impl Open {
                 (News::Panicked { id, message: message.clone() }, Some(message))
             }
         };
+        // Before the rig is free again: whoever asks for the next scan must not be told that it can have it.
+        if let Some(message) = &broken {
+            shared.down(message);
+        }
         shared.tell(news);
         broken
     }

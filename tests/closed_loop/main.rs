@@ -14,6 +14,7 @@ mod measure;
 #[allow(dead_code, reason = "the other suite needs more of it")]
 mod rig;
 mod scans;
+mod set_up;
 mod stage;
 #[path = "../window/xvfb.rs"]
 #[allow(dead_code, reason = "the window's own suite needs more of it")]

@@ -2,7 +2,7 @@
 
 use std::{
     path::{Path, PathBuf},
-    sync::{Arc, Mutex, MutexGuard},
+    sync::{Arc, Mutex, MutexGuard, PoisonError},
     time::Duration,
 };
 
@@ -148,7 +148,8 @@ impl Stage {
         let xvfb = Xvfb::start(width, height);
         let clock = Arc::new(VirtualClock::default());
         let rig = sim::Rig::new(description, scene, clock.clone()).expect("a twin");
-        let mut stage = Self { xvfb, camera: None, twin, settings, rig, clock, running: Arc::default(), frames_hz };
+        let mut stage =
+            Self { xvfb, camera: None, twin, settings, rig, clock, running: Arc::default(), frames_hz };
         stage.plug();
         stage
     }
@@ -156,7 +157,7 @@ impl Stage {
     /// Stops the camera in the middle of its next exposure until what is returned is dropped: one thread does all that
     /// it does, so that it neither sends nor answers.
     pub fn stop_camera(&self) -> MutexGuard<'_, ()> {
-        self.running.lock().expect("nothing panics with it")
+        self.running.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     fn plug(&mut self) {
@@ -169,7 +170,7 @@ impl Stage {
             [env!("CARGO_MANIFEST_DIR"), "drivers", "tests", "data", "blackfly.xml"].iter().collect();
         let running = self.running.clone();
         let paint = move |exposure: Exposure, bytes: &mut [u8]| {
-            let _stopped_meanwhile = running.lock().expect("nothing panics with it");
+            let _stopped_meanwhile = running.lock().unwrap_or_else(PoisonError::into_inner);
             assert_eq!(exposure.format, MONO12P);
             pack(&optics.expose(screen.now(), &exposure), bytes);
         };

@@ -10,8 +10,11 @@ use std::{
 };
 
 use aravis::{
-    Buffer, BufferPayloadType, BufferStatus, Stream,
-    glib::{object::ObjectType, types::Type},
+    Buffer, BufferPayloadType, BufferStatus, GvStream, GvStreamSocketBuffer, Stream,
+    glib::{
+        object::{Cast as _, ObjectType},
+        types::Type,
+    },
     prelude::*,
 };
 
@@ -127,6 +130,10 @@ impl Running {
         pool.prepare(payload as usize, frames);
         let stream = camera.create_stream().map_err(|error| failed("opening the stream", error))?;
         stream.set_emit_signals(false);
+        if let Some(stream) = stream.downcast_ref::<GvStream>() {
+            // Room for a whole frame, as far as the system allows it: nobody sends one twice.
+            stream.set_socket_buffer(GvStreamSocketBuffer::Auto);
+        }
         for buffer in pool.free() {
             stream.push_buffer(buffer.clone());
         }

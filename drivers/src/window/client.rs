@@ -16,7 +16,10 @@ use super::{
 use crate::{
     clock::{Clock, Timestamp},
     error::DeviceError,
-    projector::{DisplayState, PresentReceipt, Projector, ProjectorInfo, Slide, WindowProcess, check_slide, no_such_slide},
+    projector::{
+        DisplayState, PresentReceipt, Projector, ProjectorInfo, Slide, WindowProcess, check_slide,
+        no_such_slide,
+    },
 };
 
 /// Longest pause that a call sits out before it starts the process again; for longer ones it says when to come back.
