@@ -13,10 +13,14 @@ use std::{
 
 use polscan_drivers::{camera::CameraInfo, error::DeviceError, projector::ProjectorInfo};
 use polscan_patterns::Mode;
-use tokio::sync::oneshot;
 
 use super::{
-    disk, heartbeat::Heartbeat, metrics::Metrics, owner::Message, prepared::Prepared, preview::Preview,
+    disk,
+    heartbeat::Heartbeat,
+    metrics::Metrics,
+    owner::{Message, Reply},
+    prepared::Prepared,
+    preview::Preview,
 };
 use crate::{
     app::Rig,
@@ -69,8 +73,8 @@ pub struct Job {
 pub enum Command {
     /// Capture a scan.
     Scan(Box<Job>),
-    /// Hold a picture.
-    Show(Shown, oneshot::Sender<Result<(), Failure>>),
+    /// Hold a picture, which is called this.
+    Show(Shown, String, Reply<()>),
     /// Take a frame for the preview.
     Preview,
 }
@@ -142,6 +146,15 @@ pub enum News {
         /// What the panic said.
         message: String,
     },
+    /// A picture is held, or cannot be.
+    Shown {
+        /// How it is called.
+        name: String,
+        /// Why it cannot be.
+        held: Result<(), Failure>,
+        /// Who asked for it.
+        reply: Reply<()>,
+    },
     /// The frame for the preview has been taken, or not.
     Previewed,
 }
@@ -201,10 +214,10 @@ pub fn run(shared: &Shared, commands: &Receiver<Command>) {
                 open.as_mut().and_then(|rig| rig.alive().err()).map(|error| error.to_string())
             }
             (Ok(Command::Scan(job)), Some(rig)) => rig.scan(shared, *job),
-            (Ok(Command::Show(shown, reply)), Some(rig)) => {
+            (Ok(Command::Show(shown, name, reply)), Some(rig)) => {
                 let held = rig.show(shared, shown);
                 let broken = held.as_ref().err().and_then(broken_by);
-                let _ = reply.send(held);
+                shared.tell(News::Shown { name, held, reply });
                 broken
             }
             (Ok(Command::Preview), Some(rig)) => {
@@ -267,7 +280,7 @@ fn refuse(shared: &Shared, command: Command) {
     let failure = Failure::NoDevice { operation: "use the rig", message };
     match command {
         Command::Scan(job) => shared.tell(News::Refused { id: job.label.id, failure }),
-        Command::Show(_, reply) => drop(reply.send(Err(failure))),
+        Command::Show(_, name, reply) => shared.tell(News::Shown { name, held: Err(failure), reply }),
         Command::Preview => shared.tell(News::Previewed),
     }
 }
