@@ -86,9 +86,7 @@ impl Actor {
             let mode = usb_mode(options.usb_mode, library::version()).map_err(unavailable)?;
             camera.uv_set_usb_mode(mode);
         }
-        if camera.is_gv_device() {
-            // A packet socket, which the library takes where it may, sees whatever passes until its filter is set. Other
-            // traffic then passes for a frame with a number that all frames after it are too old for.
+        if camera.is_gv_device() && !options.packet_socket {
             camera.gv_set_stream_options(GvStreamOption::PACKET_SOCKET_DISABLED);
         }
         let features = Features::new(camera)?;

@@ -37,6 +37,9 @@ const SPARE_BUFFERS: usize = 6;
 /// Most buffers of one stream, whatever is asked for.
 const MOST_BUFFERS: usize = 256;
 
+/// Least room for packets on their way from the network to the library, in bytes.
+const SOCKET_BUFFER: i32 = 1 << 20;
+
 /// Longest that a frame takes from the end of its readout to this machine, less than whoever waits for it is patient for.
 const DELIVERY: Duration = Duration::from_millis(200);
 
@@ -131,8 +134,12 @@ impl Running {
         let stream = camera.create_stream().map_err(|error| failed("opening the stream", error))?;
         stream.set_emit_signals(false);
         if let Some(stream) = stream.downcast_ref::<GvStream>() {
-            // Room for a whole frame, as far as the system allows it: nobody sends one twice.
-            stream.set_socket_buffer(GvStreamSocketBuffer::Auto);
+            // Room for a frame and its bookkeeping, as far as the system allows it, from the first packet on. The size that
+            // the library chooses by itself is less than what the system starts with where frames are small.
+            stream.set_socket_buffer(GvStreamSocketBuffer::Fixed);
+            stream.set_socket_buffer_size(
+                i32::try_from(payload).unwrap_or(i32::MAX).saturating_mul(2).max(SOCKET_BUFFER),
+            );
         }
         for buffer in pool.free() {
             stream.push_buffer(buffer.clone());
