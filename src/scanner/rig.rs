@@ -208,22 +208,24 @@ pub fn run(shared: &Shared, commands: &Receiver<Command>) {
         }
         let wait =
             if open.is_none() { next_try.saturating_duration_since(Instant::now()).min(TICK) } else { TICK };
+        // A scan says so itself, before it gives the rig back.
+        let down = |message: &String| shared.down(message);
         let broken = match (commands.recv_timeout(wait), &mut open) {
             (Err(RecvTimeoutError::Disconnected), _) => break,
             (Err(RecvTimeoutError::Timeout), open) => {
-                open.as_mut().and_then(|rig| rig.alive().err()).map(|error| error.to_string())
+                open.as_mut().and_then(|rig| rig.alive().err()).map(|error| error.to_string()).inspect(down)
             }
             (Ok(Command::Scan(job)), Some(rig)) => rig.scan(shared, *job),
             (Ok(Command::Show(shown, name, reply)), Some(rig)) => {
                 let held = rig.show(shared, shown);
                 let broken = held.as_ref().err().and_then(broken_by);
                 shared.tell(News::Shown { name, held, reply });
-                broken
+                broken.inspect(down)
             }
             (Ok(Command::Preview), Some(rig)) => {
                 let broken = rig.preview(shared).err().map(|error| error.to_string());
                 shared.tell(News::Previewed);
-                broken
+                broken.inspect(down)
             }
             (Ok(command), None) => {
                 refuse(shared, command);
@@ -234,7 +236,6 @@ pub fn run(shared: &Shared, commands: &Receiver<Command>) {
             tracing::warn!(message, "the rig is opened again");
             // Closed first: a device cannot be opened twice.
             open = None;
-            shared.down(&message);
             shared.metrics.camera_reconnects.inc();
             next_try = Instant::now() + BACKOFF[0];
         }
