@@ -86,6 +86,18 @@ pub struct DisplayState {
     pub receipts: ReceiptMethod,
     /// What a person should know: why flips are only guessed, what bends code values.
     pub findings: Vec<String>,
+    /// The process that owns the window.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub process: Option<WindowProcess>,
+}
+
+/// The process that owns a projector's window.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct WindowProcess {
+    /// Its number; `None` where it was not started by this program but runs in the seat's session.
+    pub pid: Option<u32>,
+    /// How often it ended and was started again since the projector was opened.
+    pub restarts: u32,
 }
 
 /// Durations in files: milliseconds as a number.
@@ -119,6 +131,11 @@ pub struct ProjectorTiming {
 pub trait Projector: Send {
     /// Identity, native size and timing.
     fn info(&self) -> &ProjectorInfo;
+
+    /// Whether it is still there, as far as is known without asking it anything.
+    fn alive(&mut self) -> Result<(), DeviceError> {
+        Ok(())
+    }
 
     /// Replaces the set of slides. Refuses slides that are not of the native size.
     fn load(&mut self, slides: &[Slide]) -> Result<(), DeviceError>;

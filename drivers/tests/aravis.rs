@@ -5,7 +5,11 @@
 mod common;
 
 use std::{
-    sync::Arc,
+    net::UdpSocket,
+    sync::{
+        Arc,
+        atomic::{AtomicBool, Ordering},
+    },
     thread,
     time::{Duration, Instant},
 };
@@ -34,6 +38,8 @@ struct Bench {
 
 fn driver(options: Options) -> (AravisCameras, Arc<dyn Clock>) {
     let clock: Arc<dyn Clock> = Arc::new(MonotonicClock::start());
+    // The camera in software sends a frame faster than an ordinary socket is sure to take it.
+    let options = Options { packet_socket: true, ..options };
     (AravisCameras::new(options, clock.clone()), clock)
 }
 
@@ -351,6 +357,34 @@ fn a_trigger_that_the_camera_missed_is_a_missing_frame() {
     assert_eq!((frame.stamp.frame_id, frame.stamp.trigger), (2, 4));
     let statistics = bench.camera.disarm().unwrap();
     assert_eq!((statistics.triggers, statistics.frames, statistics.failed), (5, 3, 0));
+}
+
+#[test]
+fn other_traffic_while_a_stream_starts_is_not_taken_for_frames() {
+    let _camera = camera(Some(blackfly()));
+    let clock: Arc<dyn Clock> = Arc::new(MonotonicClock::start());
+    let cameras = AravisCameras::new(Options::default(), clock.clone());
+    let mut bench = Bench { camera: cameras.open(Some(ADDRESS)).unwrap(), clock };
+    bench.camera.apply(&small(PixelFormat::Mono8)).unwrap();
+    let talking = AtomicBool::new(true);
+    thread::scope(|scope| {
+        // Somebody else's packets on the same network, which as frames would have very high numbers.
+        scope.spawn(|| {
+            let socket = UdpSocket::bind((ADDRESS, 0)).unwrap();
+            let to = socket.local_addr().unwrap();
+            while talking.load(Ordering::Relaxed) {
+                socket.send_to(&[0xfe; 64], to).unwrap();
+                thread::sleep(Duration::from_millis(1));
+            }
+        });
+        bench.camera.arm(3).unwrap();
+        talking.store(false, Ordering::Relaxed);
+    });
+    for number in 0..3 {
+        assert_eq!(bench.take().stamp.frame_id, number);
+    }
+    let statistics = bench.camera.disarm().unwrap();
+    assert_eq!(statistics.counters["n_ignored_packets"], 0, "{:?}", statistics.counters);
 }
 
 #[test]

@@ -59,7 +59,10 @@ fn real() -> Subject {
     let clock: Arc<dyn Clock> = Arc::new(MonotonicClock::start());
     Subject {
         name: "aravis",
-        cameras: Box::new(AravisCameras::new(Options::default(), clock.clone())),
+        cameras: Box::new(AravisCameras::new(
+            Options { packet_socket: true, ..Options::default() },
+            clock.clone(),
+        )),
         clock,
         serial: ADDRESS,
         settings: settings(PixelFormat::Mono16, 1.0),

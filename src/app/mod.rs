@@ -199,6 +199,7 @@ fn aravis_options(settings: &Settings) -> aravis::Options {
             UsbMode::Sync => aravis::UsbMode::Sync,
             UsbMode::Async => aravis::UsbMode::Async,
         },
+        packet_socket: false,
     }
 }
 

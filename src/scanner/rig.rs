@@ -13,10 +13,14 @@ use std::{
 
 use polscan_drivers::{camera::CameraInfo, error::DeviceError, projector::ProjectorInfo};
 use polscan_patterns::Mode;
-use tokio::sync::oneshot;
 
 use super::{
-    disk, heartbeat::Heartbeat, metrics::Metrics, owner::Message, prepared::Prepared, preview::Preview,
+    disk,
+    heartbeat::Heartbeat,
+    metrics::Metrics,
+    owner::{Message, Reply},
+    prepared::Prepared,
+    preview::Preview,
 };
 use crate::{
     app::Rig,
@@ -69,8 +73,8 @@ pub struct Job {
 pub enum Command {
     /// Capture a scan.
     Scan(Box<Job>),
-    /// Hold a picture.
-    Show(Shown, oneshot::Sender<Result<(), Failure>>),
+    /// Hold a picture, which is called this.
+    Show(Shown, String, Reply<()>),
     /// Take a frame for the preview.
     Preview,
 }
@@ -105,6 +109,8 @@ pub enum News {
         /// Why and what to do.
         message: String,
     },
+    /// The projector was opened again without any failure.
+    Projector(Box<ProjectorInfo>),
     /// The first pattern is due.
     Started {
         /// Scan.
@@ -140,6 +146,15 @@ pub enum News {
         /// What the panic said.
         message: String,
     },
+    /// A picture is held, or cannot be.
+    Shown {
+        /// How it is called.
+        name: String,
+        /// Why it cannot be.
+        held: Result<(), Failure>,
+        /// Who asked for it.
+        reply: Reply<()>,
+    },
     /// The frame for the preview has been taken, or not.
     Previewed,
 }
@@ -164,6 +179,8 @@ pub struct Shared {
 struct Open {
     rig: Rig,
     prepared: Prepared,
+    /// What everybody knows of the projector.
+    told: ProjectorInfo,
 }
 
 /// Runs until all senders of `commands` are gone.
@@ -191,20 +208,24 @@ pub fn run(shared: &Shared, commands: &Receiver<Command>) {
         }
         let wait =
             if open.is_none() { next_try.saturating_duration_since(Instant::now()).min(TICK) } else { TICK };
+        // A scan says so itself, before it gives the rig back.
+        let down = |message: &String| shared.down(message);
         let broken = match (commands.recv_timeout(wait), &mut open) {
             (Err(RecvTimeoutError::Disconnected), _) => break,
             (Err(RecvTimeoutError::Timeout), open) => {
-                open.as_ref().and_then(|rig| rig.rig.camera.alive().err()).map(|error| error.to_string())
+                open.as_mut().and_then(|rig| rig.alive().err()).map(|error| error.to_string()).inspect(down)
             }
             (Ok(Command::Scan(job)), Some(rig)) => rig.scan(shared, *job),
-            (Ok(Command::Show(shown, reply)), Some(rig)) => {
-                let _ = reply.send(rig.show(shared, shown));
-                None
+            (Ok(Command::Show(shown, name, reply)), Some(rig)) => {
+                let held = rig.show(shared, shown);
+                let broken = held.as_ref().err().and_then(broken_by);
+                shared.tell(News::Shown { name, held, reply });
+                broken.inspect(down)
             }
             (Ok(Command::Preview), Some(rig)) => {
                 let broken = rig.preview(shared).err().map(|error| error.to_string());
                 shared.tell(News::Previewed);
-                broken
+                broken.inspect(down)
             }
             (Ok(command), None) => {
                 refuse(shared, command);
@@ -215,9 +236,7 @@ pub fn run(shared: &Shared, commands: &Receiver<Command>) {
             tracing::warn!(message, "the rig is opened again");
             // Closed first: a device cannot be opened twice.
             open = None;
-            shared.up(false);
             shared.metrics.camera_reconnects.inc();
-            shared.tell(News::Down { message });
             next_try = Instant::now() + BACKOFF[0];
         }
     }
@@ -243,6 +262,14 @@ fn guarded(open: impl FnOnce() -> Result<Open, Failure>) -> Result<Open, String>
     }
 }
 
+/// What a failure says of a device that is broken. One that refuses a setting is well.
+fn broken_by(failure: &Failure) -> Option<String> {
+    match failure {
+        Failure::Device { source, .. } if !source.is_refusal() => Some(failure.chain()),
+        _ => None,
+    }
+}
+
 /// What a panic said.
 pub fn said(panic: &(dyn std::any::Any + Send)) -> String {
     let text = panic.downcast_ref::<&str>().map(|text| (*text).to_owned());
@@ -254,7 +281,7 @@ fn refuse(shared: &Shared, command: Command) {
     let failure = Failure::NoDevice { operation: "use the rig", message };
     match command {
         Command::Scan(job) => shared.tell(News::Refused { id: job.label.id, failure }),
-        Command::Show(_, reply) => drop(reply.send(Err(failure))),
+        Command::Show(_, name, reply) => shared.tell(News::Shown { name, held: Err(failure), reply }),
         Command::Preview => shared.tell(News::Previewed),
     }
 }
@@ -263,6 +290,11 @@ impl Shared {
     fn tell(&self, news: News) {
         // Whoever does not listen any more is ending the process.
         let _ = self.news.send(Message::Rig(news));
+    }
+
+    fn down(&self, message: &str) {
+        self.up(false);
+        self.tell(News::Down { message: message.to_owned() });
     }
 
     fn up(&self, up: bool) {
@@ -275,7 +307,23 @@ impl Open {
     fn new(shared: &Shared) -> Result<Self, Failure> {
         let mut rig = Rig::open(&shared.settings).map_err(rig_failure)?;
         let prepared = Prepared::new(&shared.settings, shared.settings.mode, None, &mut rig)?;
-        Ok(Self { rig, prepared })
+        let told = rig.projector.info().clone();
+        Ok(Self { rig, prepared, told })
+    }
+
+    /// Whether camera and projector are still there.
+    fn alive(&mut self) -> Result<(), DeviceError> {
+        self.rig.camera.alive()?;
+        self.rig.projector.alive()
+    }
+
+    /// Tells what the projector is now where it was opened again meanwhile.
+    fn tell_projector(&mut self, shared: &Shared) {
+        let projector = self.rig.projector.info();
+        if *projector != self.told {
+            self.told = projector.clone();
+            shared.tell(News::Projector(Box::new(projector.clone())));
+        }
     }
 
     fn news(&self) -> News {
@@ -304,11 +352,7 @@ impl Open {
                 (News::Taken(Box::new(captured)), broken)
             }
             Ok(Err(failure)) => {
-                // A device that refuses a setting is well.
-                let broken = match &failure {
-                    Failure::Device { source, .. } if !source.is_refusal() => Some(failure.chain()),
-                    _ => None,
-                };
+                let broken = broken_by(&failure);
                 (News::Refused { id, failure }, broken)
             }
             Err(panic) => {
@@ -316,6 +360,10 @@ impl Open {
                 (News::Panicked { id, message: message.clone() }, Some(message))
             }
         };
+        // Before the rig is free again: whoever asks for the next scan must not be told that it can have it.
+        if let Some(message) = &broken {
+            shared.down(message);
+        }
         shared.tell(news);
         broken
     }
@@ -363,13 +411,16 @@ impl Open {
             }
         };
         let taken = scan.capture(&mut self.rig, &mut progress, &job.cancel);
+        self.tell_projector(shared);
         shared.metrics.stream(&self.rig.camera.info().serial, taken.statistics());
         Ok(Captured { scan, taken, writer, label: job.label })
     }
 
     fn show(&mut self, shared: &Shared, shown: Shown) -> Result<(), Failure> {
         let Rig { projector, clock, .. } = &mut self.rig;
-        hold(shown, &shared.settings, projector.as_mut(), clock.as_ref())
+        let held = hold(shown, &shared.settings, projector.as_mut(), clock.as_ref());
+        self.tell_projector(shared);
+        held
     }
 
     fn preview(&mut self, shared: &Shared) -> Result<(), DeviceError> {

@@ -50,6 +50,12 @@ impl Rig {
         self
     }
 
+    /// Leaves a table such as `sim` out.
+    pub fn without(mut self, table: &str) -> Self {
+        self.config.remove(table).expect("the table is there");
+        self
+    }
+
     /// Adds an entry to `[[sim.faults]]`, given as an inline table.
     pub fn fault(mut self, entry: &str) -> Self {
         let entry: Table =

@@ -6,30 +6,15 @@ use std::{
 };
 
 use polscan_drivers::error::DeviceError;
-use rustix::process::{Pid, Signal, kill_process};
+use rustix::process::{Signal, kill_process};
 
 use crate::{
     open, options, try_open, uniform,
-    xvfb::{Xvfb, eventually},
+    xvfb::{Xvfb, eventually, window_process},
 };
 
-/// The process with the window on `xvfb`: the one whose surroundings name its display.
-fn window_process(xvfb: &Xvfb) -> Pid {
-    let wanted = format!("DISPLAY={}", xvfb.display());
-    let is_ours = |pid: i32| {
-        let read = |name: &str| fs::read_to_string(format!("/proc/{pid}/{name}")).unwrap_or_default();
-        read("cmdline").split('\0').nth(1) == Some("projector")
-            && read("environ").split('\0').any(|variable| variable == wanted)
-    };
-    let pids = fs::read_dir("/proc").expect("processes").flatten();
-    let pids = pids.filter_map(|entry| entry.file_name().to_str()?.parse::<i32>().ok());
-    let found: Vec<i32> = pids.filter(|pid| is_ours(*pid)).collect();
-    let [pid] = found[..] else { panic!("one process with a window on {wanted}: {found:?}") };
-    Pid::from_raw(pid).expect("a process")
-}
-
 #[test]
-fn a_killed_window_is_opened_again_with_the_next_picture() {
+fn a_window_killed_between_two_pictures_is_named_once_and_opened_again() {
     let xvfb = Xvfb::start(320, 240);
     let mut projector = open(&xvfb);
     let (slide, screen) = uniform(&xvfb, [200, 100, 50]);
@@ -37,13 +22,35 @@ fn a_killed_window_is_opened_again_with_the_next_picture() {
     projector.show(0).expect("a picture");
     let first = window_process(&xvfb);
     kill_process(first, Signal::KILL).expect("it runs");
-    // Nobody asked it anything when it died, so nobody needs to hear of it. A process that has ended and was not waited
-    // for is a zombie of one thread.
+    // A process that has ended and was not waited for is a zombie of one thread.
     let proc = format!("/proc/{}", first.as_raw_nonzero());
     eventually("it has ended", || {
         let stat = fs::read_to_string(format!("{proc}/stat")).expect("its state");
         stat.contains(") Z ") && fs::read_dir(format!("{proc}/task")).expect("its threads").count() == 1
     });
+    // The picture has been gone for some time, in which somebody may have looked at it.
+    let error = projector.alive().expect_err("it is gone");
+    assert_eq!(projector.show(0).expect_err("it is gone").to_string(), error.to_string());
+    let text = error.to_string();
+    assert!(text.contains("ended while nothing was asked of it") && text.contains("signal: 9"), "{text}");
+    projector.show(0).expect("a picture of a new process");
+    projector.alive().expect("the new process");
+    let second = window_process(&xvfb);
+    assert_ne!(second, first);
+    assert!(xvfb.screen() == screen);
+    let process = projector.info().display.as_ref().and_then(|display| display.process).expect("a process");
+    assert_eq!((process.pid, process.restarts), (Some(second.as_raw_nonzero().get() as u32), 1));
+}
+
+#[test]
+fn a_window_killed_before_a_set_of_pictures_matters_to_nobody() {
+    let xvfb = Xvfb::start(320, 240);
+    let mut projector = open(&xvfb);
+    let (slide, screen) = uniform(&xvfb, [20, 10, 5]);
+    let first = window_process(&xvfb);
+    kill_process(first, Signal::KILL).expect("it runs");
+    eventually("it has ended", || projector.alive().is_err());
+    projector.load(&[slide]).expect("a slide");
     projector.show(0).expect("a picture of a new process");
     assert_ne!(window_process(&xvfb), first);
     assert!(xvfb.screen() == screen);

@@ -1,13 +1,16 @@
 //! An X server without a display, and what is on its screen.
 
 use std::{
+    fs,
     io::{BufRead, BufReader},
     process::{Child, Command, Stdio},
     time::{Duration, Instant},
 };
 
+use rustix::process::Pid;
 use x11rb::{
     connection::Connection,
+    errors::ReplyError,
     protocol::{
         Event,
         xproto::{
@@ -78,17 +81,32 @@ impl Xvfb {
 
     /// Everything that is on the screen now, row-major bytes of red, green, blue.
     pub fn screen(&self) -> Vec<u8> {
-        let (x, root) = self.connect();
-        let size = x.get_geometry(root).expect("a request").reply().expect("a size");
-        let image = x
-            .get_image(ImageFormat::Z_PIXMAP, root, 0, 0, size.width, size.height, !0)
-            .expect("a request")
-            .reply()
-            .expect("a picture");
-        assert_eq!(image.depth, 24);
-        // 32 bits per pixel: blue, green, red, nothing.
-        image.data.chunks_exact(4).flat_map(|pixel| [pixel[2], pixel[1], pixel[0]]).collect()
+        grab(&self.connect()).expect("a picture").as_flattened().to_vec()
     }
+}
+
+/// Everything that is on a screen now, row-major red, green, blue; fails where its server is gone.
+pub fn grab((x, root): &(RustConnection, Window)) -> Result<Vec<[u8; 3]>, ReplyError> {
+    let size = x.get_geometry(*root)?.reply()?;
+    let image = x.get_image(ImageFormat::Z_PIXMAP, *root, 0, 0, size.width, size.height, !0)?.reply()?;
+    assert_eq!(image.depth, 24);
+    // 32 bits per pixel: blue, green, red, nothing.
+    Ok(image.data.chunks_exact(4).map(|pixel| [pixel[2], pixel[1], pixel[0]]).collect())
+}
+
+/// The process with the window on `xvfb`: the one whose surroundings name its display.
+pub fn window_process(xvfb: &Xvfb) -> Pid {
+    let wanted = format!("DISPLAY={}", xvfb.display());
+    let is_ours = |pid: i32| {
+        let read = |name: &str| fs::read_to_string(format!("/proc/{pid}/{name}")).unwrap_or_default();
+        read("cmdline").split('\0').nth(1) == Some("projector")
+            && read("environ").split('\0').any(|variable| variable == wanted)
+    };
+    let pids = fs::read_dir("/proc").expect("processes").flatten();
+    let pids = pids.filter_map(|entry| entry.file_name().to_str()?.parse::<i32>().ok());
+    let found: Vec<i32> = pids.filter(|pid| is_ours(*pid)).collect();
+    let [pid] = found[..] else { panic!("one process with a window on {wanted}: {found:?}") };
+    Pid::from_raw(pid).expect("a process")
 }
 
 impl Drop for Xvfb {

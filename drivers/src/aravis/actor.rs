@@ -9,7 +9,7 @@ use std::{
     time::Duration,
 };
 
-use aravis::{GvDevice, glib::prelude::*, prelude::*};
+use aravis::{GvDevice, GvStreamOption, glib::prelude::*, prelude::*};
 
 use super::{
     checklist::{self, Applied},
@@ -85,6 +85,9 @@ impl Actor {
         if camera.is_uv_device() {
             let mode = usb_mode(options.usb_mode, library::version()).map_err(unavailable)?;
             camera.uv_set_usb_mode(mode);
+        }
+        if camera.is_gv_device() && !options.packet_socket {
+            camera.gv_set_stream_options(GvStreamOption::PACKET_SOCKET_DISABLED);
         }
         let features = Features::new(camera)?;
         if features.device().downcast_ref::<GvDevice>().is_some_and(|device| !device.is_controller()) {

@@ -21,4 +21,8 @@ pub struct Options {
     pub black_level: Option<f64>,
     /// How USB cameras send.
     pub usb_mode: UsbMode,
+    /// Whether frames of GigE cameras are taken by a packet socket where the process may open one. It loses less, but
+    /// until the library has set its filter it sees what passes on any network: such a packet is then taken for a frame
+    /// whose number all frames of the stream are too old for.
+    pub packet_socket: bool,
 }

@@ -10,8 +10,11 @@ use std::{
 };
 
 use aravis::{
-    Buffer, BufferPayloadType, BufferStatus, Stream,
-    glib::{object::ObjectType, types::Type},
+    Buffer, BufferPayloadType, BufferStatus, GvStream, GvStreamSocketBuffer, Stream,
+    glib::{
+        object::{Cast as _, ObjectType},
+        types::Type,
+    },
     prelude::*,
 };
 
@@ -33,6 +36,9 @@ const SPARE_BUFFERS: usize = 6;
 
 /// Most buffers of one stream, whatever is asked for.
 const MOST_BUFFERS: usize = 256;
+
+/// Least room for packets on their way from the network to the library, in bytes.
+const SOCKET_BUFFER: i32 = 1 << 20;
 
 /// Longest that a frame takes from the end of its readout to this machine, less than whoever waits for it is patient for.
 const DELIVERY: Duration = Duration::from_millis(200);
@@ -127,6 +133,14 @@ impl Running {
         pool.prepare(payload as usize, frames);
         let stream = camera.create_stream().map_err(|error| failed("opening the stream", error))?;
         stream.set_emit_signals(false);
+        if let Some(stream) = stream.downcast_ref::<GvStream>() {
+            // Room for a frame and its bookkeeping, as far as the system allows it, from the first packet on. The size that
+            // the library chooses by itself is less than what the system starts with where frames are small.
+            stream.set_socket_buffer(GvStreamSocketBuffer::Fixed);
+            stream.set_socket_buffer_size(
+                i32::try_from(payload).unwrap_or(i32::MAX).saturating_mul(2).max(SOCKET_BUFFER),
+            );
+        }
         for buffer in pool.free() {
             stream.push_buffer(buffer.clone());
         }

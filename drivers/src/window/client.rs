@@ -16,7 +16,10 @@ use super::{
 use crate::{
     clock::{Clock, Timestamp},
     error::DeviceError,
-    projector::{DisplayState, PresentReceipt, Projector, ProjectorInfo, Slide, check_slide, no_such_slide},
+    projector::{
+        DisplayState, PresentReceipt, Projector, ProjectorInfo, Slide, WindowProcess, check_slide,
+        no_such_slide,
+    },
 };
 
 /// Longest pause that a call sits out before it starts the process again; for longer ones it says when to come back.
@@ -33,6 +36,8 @@ pub(super) struct WindowProjector {
     slides: Option<Vec<Slide>>,
     /// Whether the process that runs has the slides.
     loaded: bool,
+    /// Whether one of them was shown: then the end of the process took it off the display, which must not go unsaid.
+    held: bool,
 }
 
 impl WindowProjector {
@@ -50,7 +55,7 @@ impl WindowProjector {
         let (process, hello) = start(&options, &want)?;
         let mut supervisor = Supervisor::default();
         supervisor.ready(clock.now());
-        let info = info(&hello);
+        let info = info(&hello, process.id(), 0);
         Ok(Self {
             options,
             want,
@@ -60,6 +65,7 @@ impl WindowProjector {
             info,
             slides: None,
             loaded: false,
+            held: false,
         })
     }
 
@@ -80,7 +86,7 @@ impl WindowProjector {
             }
             self.clock.sleep_until(now + wait);
             let started = start(&self.options, &self.want).and_then(|(process, hello)| {
-                let has = info(&hello);
+                let has = info(&hello, process.id(), self.supervisor.ends());
                 let same = |info: &ProjectorInfo| {
                     (info.serial.clone(), info.width, info.height, info.refresh_period)
                 };
@@ -89,7 +95,7 @@ impl WindowProjector {
                     format!("{} with {} x {} at {hz:.2} Hz", info.serial, info.width, info.height)
                 };
                 if same(&has) == same(&self.info) {
-                    return Ok(process);
+                    return Ok((process, has));
                 }
                 Err(DeviceError::Refused {
                     device: self.info.serial.clone(),
@@ -99,9 +105,10 @@ impl WindowProjector {
                 })
             });
             match started {
-                Ok(process) => {
+                Ok((process, info)) => {
                     self.supervisor.ready(self.clock.now());
                     self.process = Some(process);
+                    self.info = info;
                 }
                 Err(error) => {
                     self.supervisor.ended(self.clock.now());
@@ -194,12 +201,21 @@ impl Projector for WindowProjector {
         &self.info
     }
 
+    fn alive(&mut self) -> Result<(), DeviceError> {
+        let Some(process) = &mut self.process else { return Ok(()) };
+        if process.is_there() {
+            return Ok(());
+        }
+        Err(gone(process, &self.info.serial, "ended while nothing was asked of it"))
+    }
+
     fn load(&mut self, slides: &[Slide]) -> Result<(), DeviceError> {
         for (number, slide) in slides.iter().enumerate() {
             check_slide(&self.info, number, slide)?;
         }
         self.slides = Some(slides.to_vec());
         self.loaded = false;
+        self.held = false;
         self.ready()
     }
 
@@ -210,6 +226,11 @@ impl Projector for WindowProjector {
         };
         if index as usize >= slides.len() {
             return Err(no_such_slide(&self.info, index, slides.len()));
+        }
+        let held = std::mem::replace(&mut self.held, true);
+        if held && let Err(gone) = self.alive() {
+            self.end();
+            return Err(gone);
         }
         self.present(Some(index))
     }
@@ -274,14 +295,16 @@ fn ask(
             awaited,
             timeout_ms: patience.as_millis() as u64,
         },
-        Silence::Gone(cause) => DeviceError::Unavailable {
-            device: device.to_owned(),
-            detail: format!(
-                "the process with its window is gone ({cause}; {}); it is started again with the next picture",
-                process.last_words()
-            ),
-        },
+        Silence::Gone(cause) => gone(process, device, &cause.to_string()),
     })
+}
+
+fn gone(process: &mut Process, device: &str, cause: &str) -> DeviceError {
+    let detail = format!(
+        "the process with its window is gone ({cause}; {}); it is started again with the next picture",
+        process.last_words()
+    );
+    DeviceError::Unavailable { device: device.to_owned(), detail }
 }
 
 /// A fault of the window as what can go wrong with a device.
@@ -299,7 +322,7 @@ pub(super) fn error(device: &str, fault: Fault) -> DeviceError {
     }
 }
 
-fn info(hello: &Hello) -> ProjectorInfo {
+fn info(hello: &Hello, pid: Option<u32>, restarts: u32) -> ProjectorInfo {
     ProjectorInfo {
         driver: DRIVER.to_owned(),
         model: hello.model.clone(),
@@ -313,6 +336,7 @@ fn info(hello: &Hello) -> ProjectorInfo {
             format: hello.format.clone(),
             receipts: hello.method,
             findings: hello.findings.clone(),
+            process: Some(WindowProcess { pid, restarts }),
         }),
     }
 }

@@ -84,6 +84,11 @@ impl Process {
         Ok(Self { stream, child: Some(child), lines })
     }
 
+    /// Number of the process where it was started here.
+    pub fn id(&self) -> Option<u32> {
+        self.child.as_ref().map(Child::id)
+    }
+
     /// Sends `messages` and waits for an answer until `deadline`.
     pub fn ask(&self, messages: &[Vec<u8>], deadline: Instant) -> Result<Reply, Silence> {
         for message in messages {

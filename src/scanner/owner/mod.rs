@@ -291,7 +291,7 @@ impl Owner {
             Message::Delete(id, reply) => Some(answer(self.delete(&id), reply)),
             Message::Change(id, change, reply) => Some(answer(self.change(&id, change), reply)),
             Message::Hold(held, reply) => Some(answer(Ok(self.hold(held)), reply)),
-            Message::Show(shown, name, reply) => Some(self.show(shown, name, reply)),
+            Message::Show(shown, name, reply) => self.show(shown, name, reply),
             Message::Preview => {
                 self.preview();
                 None
@@ -300,10 +300,7 @@ impl Owner {
                 self.stop(grace);
                 None
             }
-            Message::Rig(news) => {
-                self.rig_news(news);
-                None
-            }
+            Message::Rig(news) => self.rig_news(news),
             Message::Finish(news) => {
                 self.finish_news(news);
                 None

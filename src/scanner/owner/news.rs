@@ -3,8 +3,10 @@
 use super::*;
 
 impl Owner {
-    pub(super) fn rig_news(&mut self, news: rig::News) {
+    /// The answer is for whoever asked the rig through the owner.
+    pub(super) fn rig_news(&mut self, news: rig::News) -> Option<Answer> {
         match news {
+            rig::News::Shown { name, held, reply } => return Some(self.shown(name, held, reply)),
             rig::News::Open { camera, projector, scan_bytes } => {
                 self.rig = RigStatus {
                     state: RigState::Ready,
@@ -17,6 +19,7 @@ impl Owner {
                 self.rig_event();
             }
             rig::News::Down { message } => self.rig_down(message),
+            rig::News::Projector(projector) => self.rig.projector = Some(*projector),
             rig::News::Started { id, frames } => {
                 self.edit(&id, |record| record.progress.of = frames);
                 self.progress(&id);
@@ -42,6 +45,18 @@ impl Owner {
             }
             rig::News::Previewed => self.previewing = false,
         }
+        None
+    }
+
+    fn shown(&mut self, name: String, held: Result<(), Failure>, reply: Reply<()>) -> Answer {
+        let held = held.map_err(|failure| Denied::Rig(failure.chain()));
+        // A scan that has begun meanwhile has taken the picture away.
+        if held.is_ok() && self.active.is_none() {
+            self.rig.showing = (name != "black").then_some(name);
+            let showing = self.rig.showing.clone();
+            self.event("projector", |_| serde_json::json!({ "show": showing }).to_string());
+        }
+        answer(held, reply)
     }
 
     pub(super) fn rig_down(&mut self, message: String) {

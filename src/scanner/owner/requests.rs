@@ -275,34 +275,17 @@ impl Owner {
         ids.len()
     }
 
-    pub(super) fn show(&mut self, shown: Shown, name: String, reply: Reply<()>) -> Answer {
+    /// Asks the rig, which answers with its news, or refuses at once.
+    pub(super) fn show(&mut self, shown: Shown, name: String, reply: Reply<()>) -> Option<Answer> {
         let situation = self.situation();
         if let Some(obstacle) = situation.obstacles.iter().find(|one| one.kind != "storage") {
-            return answer(Err(Denied::Refused(Refusal::NotReady(vec![obstacle.clone()]))), reply);
+            return Some(answer(Err(Denied::Refused(Refusal::NotReady(vec![obstacle.clone()]))), reply));
         }
         if let Some(holder) = situation.holder {
-            return answer(Err(Denied::Refused(Refusal::Busy(holder))), reply);
+            return Some(answer(Err(Denied::Refused(Refusal::Busy(holder))), reply));
         }
-        self.rig.showing = (name != "black").then_some(name);
-        let showing = self.rig.showing.clone();
-        self.event("projector", |_| serde_json::json!({ "show": showing }).to_string());
-        let (sender, receiver) = oneshot::channel::<Result<(), Failure>>();
-        let rig = self.out.rig.clone();
-        // The owner must not wait for a device; a thread of a moment may.
-        let wait = move || {
-            let shown = match receiver.blocking_recv() {
-                Ok(Ok(())) => Ok(()),
-                Ok(Err(failure)) => Err(Denied::Rig(failure.chain())),
-                Err(_) => Err(Denied::Rig("the rig went away".to_owned())),
-            };
-            let _ = reply.send(shown);
-        };
-        Box::new(move || {
-            let _ = rig.send(rig::Command::Show(shown, sender));
-            if let Err(error) = std::thread::Builder::new().name("show".to_owned()).spawn(wait) {
-                tracing::warn!(%error, "no thread for an answer");
-            }
-        })
+        let _ = self.out.rig.send(rig::Command::Show(shown, name, reply));
+        None
     }
 
     pub(super) fn preview(&mut self) {
