@@ -29,7 +29,7 @@ pub struct Summary {
 }
 
 /// What a calibration came to, all of it written.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub struct Outcome {
     /// Names of the files in its folder.
     pub files: Vec<String>,

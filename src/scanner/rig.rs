@@ -1,6 +1,8 @@
 //! The thread that owns the rig: opens it, and opens it again after a failure; captures scans; holds pictures; takes
 //! single frames for the preview. Nothing else ever touches a device.
 
+pub mod calibrate;
+
 use std::{
     panic::{AssertUnwindSafe, catch_unwind},
     path::PathBuf,
@@ -69,6 +71,8 @@ pub struct Job {
 pub enum Command {
     /// Capture a scan.
     Scan(Box<Job>),
+    /// Calibrate.
+    Calibrate(Box<calibrate::Job>),
     /// Hold a picture.
     Show(Shown, oneshot::Sender<Result<(), Failure>>),
     /// Take a frame for the preview.
@@ -140,6 +144,13 @@ pub enum News {
         /// What the panic said.
         message: String,
     },
+    /// A calibration goes on or has come to its end.
+    Calibration {
+        /// Calibration.
+        id: String,
+        /// What it tells.
+        said: calibrate::Said,
+    },
     /// The frame for the preview has been taken, or not.
     Previewed,
 }
@@ -197,6 +208,7 @@ pub fn run(shared: &Shared, commands: &Receiver<Command>) {
                 open.as_ref().and_then(|rig| rig.rig.camera.alive().err()).map(|error| error.to_string())
             }
             (Ok(Command::Scan(job)), Some(rig)) => rig.scan(shared, *job),
+            (Ok(Command::Calibrate(job)), Some(rig)) => rig.calibrate(shared, &job),
             (Ok(Command::Show(shown, reply)), Some(rig)) => {
                 let _ = reply.send(rig.show(shared, shown));
                 None
@@ -254,6 +266,10 @@ fn refuse(shared: &Shared, command: Command) {
     let failure = Failure::NoDevice { operation: "use the rig", message };
     match command {
         Command::Scan(job) => shared.tell(News::Refused { id: job.label.id, failure }),
+        Command::Calibrate(job) => {
+            let said = calibrate::Said::Ended(Err(failure.into()));
+            shared.tell(News::Calibration { id: job.id, said });
+        }
         Command::Show(_, reply) => drop(reply.send(Err(failure))),
         Command::Preview => shared.tell(News::Previewed),
     }

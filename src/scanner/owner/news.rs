@@ -40,6 +40,7 @@ impl Owner {
                 let message = format!("a defect of this program: {message}");
                 self.end(&id, State::Failed, |record| record.blame("internal", message));
             }
+            rig::News::Calibration { id, said } => self.calibration_news(&id, said),
             rig::News::Previewed => self.previewing = false,
         }
     }
