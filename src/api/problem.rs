@@ -183,7 +183,10 @@ impl From<Denied> for Problem {
             Denied::Refused(Refusal::Busy(holder)) if let Some(kind) = holder.calibration => {
                 let kind = kind.name();
                 Kind::Busy
-                    .with(format!("calibration {} ({kind}) has the rig; wait for it, or cancel it", holder.id))
+                    .with(format!(
+                        "calibration {} ({kind}) has the rig; wait for it, or cancel it",
+                        holder.id
+                    ))
                     .and("holder", json!(holder))
             }
             Denied::Refused(Refusal::Busy(holder)) => Kind::Busy

@@ -125,7 +125,13 @@ mod tests {
     use super::*;
 
     fn holder(id: &str) -> Holder {
-        Holder { id: id.to_owned(), state: State::Projecting, label: None, created: String::new(), calibration: None }
+        Holder {
+            id: id.to_owned(),
+            state: State::Projecting,
+            label: None,
+            created: String::new(),
+            calibration: None,
+        }
     }
 
     prop_compose! {

@@ -13,8 +13,9 @@ use std::{
 use tokio::sync::{oneshot, watch};
 
 use super::{
-    EventLog, Heartbeat, Metrics, Preview, Record, Snapshot, disk, finish,
+    EventLog, Heartbeat, Metrics, Preview, Record, Snapshot,
     calibration::CalibrationRecord,
+    disk, finish,
     owner::{CalibrationAsk, Change, Denied, Message, Outlets, Owner, Submit},
     rig,
 };

@@ -144,7 +144,8 @@ impl Owner {
                 }
                 Err(_) if stopped && watches && !stopping => CalibrationState::Done,
                 Err(_) if stopped && stopping => {
-                    record.blame("interrupted", "the service ended before the calibration did; start it again");
+                    record
+                        .blame("interrupted", "the service ended before the calibration did; start it again");
                     CalibrationState::Interrupted
                 }
                 Err(_) if stopped => {

@@ -115,4 +115,3 @@ pub enum Message {
     /// From the finisher.
     Finish(finish::News),
 }
-
