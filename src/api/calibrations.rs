@@ -159,6 +159,12 @@ pub async fn post_sync(
     begin(&app, Task::Sync, Vec::new()).await
 }
 
+/// Identity of a calibration.
+#[derive(ToSchema)]
+#[schema(pattern = "^[a-z0-9][a-z0-9-]{0,63}$")]
+#[expect(dead_code, reason = "only its schema is used")]
+pub struct CalibrationId(String);
+
 /// What a polarization is measured with. Everything may be left out.
 #[derive(Debug, Default, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields, default)]
@@ -167,10 +173,12 @@ pub struct PolarizationRequest {
     #[schema(minimum = -360.0, maximum = 360.0)]
     pub angle_deg: Option<f64>,
     /// Calibrations of polarization at other angles. Three angles in all make a calibration.
-    #[schema(max_items = 32)]
+    #[schema(max_items = 32, value_type = Vec<CalibrationId>)]
     pub with: Vec<String>,
+    #[schema(pattern = "^[^=]*[^= ]=[0-9]{1,4},[0-9]{1,4},[1-9][0-9]{1,3},[1-9][0-9]{1,3}$")]
     /// Bare metal in the camera's image, `NAME=X,Y,W,H` in pixels; what is evenly lit where it is left out.
     pub coupon: Option<String>,
+    #[schema(pattern = "^[^=]*[^= ]=[0-9]{1,4},[0-9]{1,4},[1-9][0-9]{1,3},[1-9][0-9]{1,3}$")]
     /// A white card in the camera's image, `NAME=X,Y,W,H`, to find the drive levels at which it returns H and V alike.
     pub card: Option<String>,
     /// Only watch H and V for so many seconds while somebody turns the polarizer; values come as events
@@ -300,6 +308,7 @@ pub async fn cancel_calibration(
         (status = 200, description = "The file", content(
             ([u8] = "application/octet-stream"), (Object = "application/json"), (String = "application/toml"),
             (String = "image/svg+xml"))),
+        (status = 304, description = "The client has it"),
         (status = 404, description = "Unknown calibration, or it has no such file", body = ProblemBody, content_type = "application/problem+json"),
         (status = 409, description = "Not yet", body = ProblemBody, content_type = "application/problem+json")))]
 pub async fn get_calibration_file(
