@@ -47,7 +47,8 @@ fn cancel(daemon: &Daemon, id: &str) -> Answer {
 
 /// Names of the files of a calibration.
 fn names(run: &Value) -> Vec<&str> {
-    run["artifacts"].as_array().expect("files").iter().map(|file| file["name"].as_str().unwrap()).collect()
+    let files = run["artifacts"].as_array().expect("files").iter();
+    files.map(|file| file["name"].as_str().expect("a name")).collect()
 }
 
 fn text(daemon: &Daemon, id: &str, name: &str) -> String {
