@@ -3,6 +3,7 @@
 
 pub mod api;
 pub mod app;
+pub mod calibrate;
 pub mod cli;
 pub mod commands;
 pub mod compare;

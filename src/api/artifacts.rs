@@ -14,6 +14,7 @@ use axum::{
     response::{IntoResponse, Response},
 };
 use serde::Serialize;
+use sha2::Digest as _;
 use tokio::io::{AsyncReadExt, AsyncSeekExt};
 use tokio_util::io::ReaderStream;
 use utoipa::ToSchema;
@@ -75,7 +76,7 @@ struct Found {
 
 /// Reads the manifest of a bundle; the hash of the file itself comes with it.
 fn manifest(folder: &Path) -> Option<(Manifest, FileEntry)> {
-    use sha2::{Digest, Sha256};
+    use sha2::Sha256;
     let bytes = std::fs::read(folder.join(FILE_NAME)).ok()?;
     let manifest = Manifest::parse(&bytes).ok()?.manifest;
     Some((manifest, FileEntry { bytes: bytes.len() as u64, sha256: hex(&Sha256::digest(&bytes)) }))
@@ -138,6 +139,7 @@ fn media_type(name: &str) -> &'static str {
     match name.rsplit('.').next() {
         Some("json") => "application/json",
         Some("png") => "image/png",
+        Some("svg") => "image/svg+xml",
         Some("toml") => "application/toml",
         Some("npz" | "zip") => "application/zip",
         _ => "application/octet-stream",
@@ -227,6 +229,20 @@ async fn serve(app: &App, id: &str, name: &str, headers: &HeaderMap) -> Result<R
     answer.insert(header::CONTENT_LENGTH, HeaderValue::from(length));
     let body = Body::from_stream(ReaderStream::with_capacity(file.take(length), CHUNK));
     Ok((status, answer, body).into_response())
+}
+
+/// A small file as a whole; one that went away meanwhile is none.
+pub async fn serve_file(path: &Path, name: &str, headers: &HeaderMap) -> Response {
+    let Ok(bytes) = tokio::fs::read(path).await else { return no_artifact(name).into_response() };
+    let tag = format!("\"{}\"", hex(&sha2::Sha256::digest(&bytes)));
+    let mut answer = HeaderMap::new();
+    answer.insert(header::ETAG, HeaderValue::from_str(&tag).unwrap_or(HeaderValue::from_static("")));
+    answer.insert(header::CONTENT_TYPE, HeaderValue::from_static(media_type(name)));
+    answer.insert(header::CACHE_CONTROL, HeaderValue::from_static("private, no-cache"));
+    if has_tag(header_text(headers, header::IF_NONE_MATCH), &tag) {
+        return (StatusCode::NOT_MODIFIED, answer).into_response();
+    }
+    (answer, bytes).into_response()
 }
 
 /// A file of a scan

@@ -25,6 +25,7 @@ const BEARER: &str = "token";
     tags(
         (name = "scans", description = "Ask for scans, look at them, stop, change and delete them"),
         (name = "artifacts", description = "Files of a scan"),
+        (name = "calibrations", description = "Measure what the rig is like"),
         (name = "live", description = "What goes on while it goes on"),
         (name = "service", description = "The service itself")
     )

@@ -3,6 +3,7 @@
 
 mod artifacts;
 mod auth;
+mod calibrations;
 mod document;
 mod extract;
 mod live;
@@ -150,8 +151,14 @@ fn router() -> OpenApiRouter<App> {
         .routes(routes!(system::get_devices))
         .routes(routes!(system::get_config))
         .routes(routes!(system::put_projector))
-        .routes(routes!(system::get_calibrations))
-        .routes(routes!(system::post_calibration))
+        .routes(routes!(calibrations::get_calibrations))
+        .routes(routes!(calibrations::post_noise))
+        .routes(routes!(calibrations::post_sync))
+        .routes(routes!(calibrations::post_polarization))
+        .routes(routes!(calibrations::post_rig))
+        .routes(routes!(calibrations::get_calibration, calibrations::post_unknown))
+        .routes(routes!(calibrations::cancel_calibration))
+        .routes(routes!(calibrations::get_calibration_file))
         .routes(routes!(system::livez))
         .routes(routes!(system::readyz))
         .routes(routes!(system::metrics))

@@ -25,6 +25,8 @@ pub enum Kind {
     NotFound,
     /// There is no scan of this identity.
     UnknownScan,
+    /// There is no calibration of this identity.
+    UnknownCalibration,
     /// The scan has no such file.
     NoArtifact,
     /// The address takes other methods.
@@ -66,19 +68,20 @@ pub enum Kind {
 }
 
 /// One row of the table: slug, status, title.
-const TABLE: [(Kind, &str, u16, &str); 25] = [
+const TABLE: [(Kind, &str, u16, &str); 26] = [
     (Kind::Malformed, "malformed", 400, "the request cannot be read"),
     (Kind::Unauthorized, "unauthorized", 401, "a token is needed"),
     (Kind::Scope, "insufficient-scope", 403, "the token does not allow this"),
     (Kind::Foreign, "foreign-origin", 403, "the request does not come from this machine"),
     (Kind::NotFound, "not-found", 404, "there is nothing here"),
     (Kind::UnknownScan, "unknown-scan", 404, "there is no such scan"),
-    (Kind::NoArtifact, "no-artifact", 404, "the scan has no such file"),
+    (Kind::UnknownCalibration, "unknown-calibration", 404, "there is no such calibration"),
+    (Kind::NoArtifact, "no-artifact", 404, "there is no such file"),
     (Kind::Method, "method-not-allowed", 405, "this address takes other methods"),
     (Kind::Timeout, "request-timeout", 408, "the request took too long to arrive"),
-    (Kind::Busy, "busy", 409, "another scan has the rig"),
-    (Kind::NotFinished, "not-finished", 409, "the scan has no result yet"),
-    (Kind::State, "wrong-state", 409, "the scan's state does not allow this"),
+    (Kind::Busy, "busy", 409, "another scan or a calibration has the rig"),
+    (Kind::NotFinished, "not-finished", 409, "there is no result yet"),
+    (Kind::State, "wrong-state", 409, "the state does not allow this"),
     (Kind::Pinned, "pinned", 409, "the scan is pinned"),
     (Kind::InUse, "in-use", 409, "another scan was decoded from its frames"),
     (Kind::TooLarge, "too-large", 413, "the request is too large"),
@@ -177,6 +180,15 @@ impl IntoResponse for Problem {
 impl From<Denied> for Problem {
     fn from(denied: Denied) -> Self {
         match denied {
+            Denied::Refused(Refusal::Busy(holder)) if let Some(kind) = holder.calibration => {
+                let kind = kind.name();
+                Kind::Busy
+                    .with(format!(
+                        "calibration {} ({kind}) has the rig; wait for it, or cancel it",
+                        holder.id
+                    ))
+                    .and("holder", json!(holder))
+            }
             Denied::Refused(Refusal::Busy(holder)) => Kind::Busy
                 .with(format!("scan {} has the rig; wait for it, or post with \"queue\": true", holder.id))
                 .and("holder", json!(holder)),
@@ -199,6 +211,14 @@ impl From<Denied> for Problem {
             }
             Denied::Pinned => Kind::Pinned.with("PATCH it with \"pinned\": false first"),
             Denied::InUse => Kind::InUse.with("delete the scans that were decoded from it first"),
+            Denied::UnknownCalibration => Kind::UnknownCalibration
+                .with("no calibration has this identity; GET /v1/calibrations lists them"),
+            Denied::CalibrationEnded(state) => {
+                let state = state.name();
+                Kind::State
+                    .with(format!("the calibration is {state}, which does not allow this"))
+                    .and("state", state)
+            }
             Denied::NoBundle => Kind::State.with("the scan left no frames"),
             Denied::Storage(message) => {
                 let reasons = json!([{ "type": "storage", "message": message }]);

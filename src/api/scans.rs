@@ -42,7 +42,8 @@ fn accepted(scan: &Scan) -> Response {
     response
 }
 
-fn invalid(key: &str, message: impl Into<String>) -> Problem {
+/// A problem with the value of a key.
+pub(super) fn invalid(key: &str, message: impl Into<String>) -> Problem {
     let message = message.into();
     let errors = serde_json::json!([{ "key": key, "message": message }]);
     Kind::Invalid.with(format!("{key}: {message}")).and("errors", errors)

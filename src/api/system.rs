@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use axum::{
     Json,
-    extract::{Path as Part, State as Shared, rejection::PathRejection},
+    extract::State as Shared,
     http::{StatusCode, header},
     response::{IntoResponse, Response},
 };
@@ -15,16 +15,13 @@ use utoipa::ToSchema;
 
 use super::{
     App,
-    extract::{Body, MaybeBody},
+    extract::Body,
     problem::{Kind, Problem, ProblemBody},
-    scans::Empty,
 };
 use crate::{
     app,
     engine::Shown,
-    geometry::{Calibration, ReadHints},
     scanner::{Obstacle, RigState, Snapshot, StorageStatus},
-    store::source::read_calibration,
 };
 
 /// Whether the service can scan.
@@ -80,10 +77,12 @@ pub struct Status {
     ready: bool,
     /// Why not.
     reasons: Vec<Obstacle>,
-    /// `idle`, `scanning`, `stopping` or `fault`.
+    /// `idle`, `scanning`, `calibrating`, `stopping` or `fault`.
     state: &'static str,
     /// The scan that has the rig.
     capturing: Option<String>,
+    /// The calibration that has the rig.
+    calibrating: Option<String>,
     /// Scans that are decoded or wait for it.
     finishing: Vec<String>,
     /// Scans that wait for the rig, in order.
@@ -124,6 +123,7 @@ pub async fn get_status(Shared(app): Shared<App>) -> Json<Status> {
     let state = match snapshot.rig.state {
         _ if snapshot.stopping => "stopping",
         RigState::Fault => "fault",
+        _ if snapshot.calibrating.is_some() => "calibrating",
         _ if snapshot.capturing.is_some() || !snapshot.finishing.is_empty() => "scanning",
         _ => "idle",
     };
@@ -135,6 +135,7 @@ pub async fn get_status(Shared(app): Shared<App>) -> Json<Status> {
         reasons: readiness.reasons,
         state,
         capturing: snapshot.capturing.clone(),
+        calibrating: snapshot.calibrating.clone(),
         finishing: snapshot.finishing.clone(),
         queue: snapshot.queue.clone(),
         held,
@@ -246,71 +247,4 @@ pub async fn put_projector(
     })?;
     app.scanner.show(shown, &asked.show).await?;
     Ok(Json(asked))
-}
-
-/// A calibration in use.
-#[derive(Debug, Serialize, ToSchema)]
-pub struct CalibrationInUse {
-    /// SHA-256 of its canonical form; bundles name it.
-    id: String,
-    /// File.
-    file: String,
-    /// What is calibrated.
-    kind: &'static str,
-    /// What it says of its own quality.
-    #[schema(value_type = Object)]
-    quality: Value,
-}
-
-/// Calibrations.
-#[derive(Debug, Serialize, ToSchema)]
-pub struct Calibrations {
-    calibrations: Vec<CalibrationInUse>,
-}
-
-/// Calibrations in use
-#[utoipa::path(get, path = "/v1/calibrations", tag = "service",
-    responses((status = 200, description = "Calibrations", body = Calibrations),
-        (status = 503, description = "The file cannot be read", body = ProblemBody, content_type = "application/problem+json")))]
-pub async fn get_calibrations(Shared(app): Shared<App>) -> Result<Json<Calibrations>, Problem> {
-    let Some(rig) = app.settings.calibration.clone() else {
-        return Ok(Json(Calibrations { calibrations: Vec::new() }));
-    };
-    let snapshot = app.scanner.snapshot();
-    let hints = ReadHints {
-        camera_size: snapshot.rig.camera.as_ref().map(|camera| (camera.sensor_width, camera.sensor_height)),
-        projector_size: snapshot.rig.projector.as_ref().map(|projector| (projector.width, projector.height)),
-        swap: rig.projector_left,
-        unit_mm: rig.unit_mm,
-    };
-    let path = rig.path.clone();
-    let read = app.blocking(move || read_calibration(&path, &hints)).await?;
-    let calibration: Calibration = read.map_err(|error| Kind::NotReady.with(error.to_string()))?;
-    let in_use = CalibrationInUse {
-        id: calibration.id(),
-        file: rig.path.display().to_string(),
-        kind: "rig",
-        quality: json!(crate::report::CalibrationReport::new(None, &calibration.quality)),
-    };
-    Ok(Json(Calibrations { calibrations: vec![in_use] }))
-}
-
-/// Calibrate
-///
-/// Not part of the service yet: use `polscan calibrate` on the command line.
-#[utoipa::path(post, path = "/v1/calibrations/{kind}", tag = "service",
-    params(("kind" = String, Path, description = "`rig`, `sync`, `noise` or `polarization`")),
-    responses((status = 404, description = "Unknown kind", body = ProblemBody, content_type = "application/problem+json"),
-        (status = 501, description = "Not part of the service", body = ProblemBody, content_type = "application/problem+json")))]
-pub async fn post_calibration(
-    kind: Result<Part<String>, PathRejection>,
-    MaybeBody(Empty {}): MaybeBody<Empty>,
-) -> Problem {
-    match kind.map(|Part(kind)| kind) {
-        Ok(kind) if ["rig", "sync", "noise", "polarization"].contains(&kind.as_str()) => Kind::Unsupported
-            .with(format!(
-                "the service does not calibrate {kind} yet; give it a calibration file in rig.calibration"
-            )),
-        _ => Kind::NotFound.with("calibrations are rig, sync, noise and polarization"),
-    }
 }

@@ -216,6 +216,7 @@ async fn tell_status(scanner: Scanner, notify: Arc<Notify>) {
 fn in_words(snapshot: &Snapshot) -> String {
     let rig = match (&snapshot.capturing, snapshot.rig.state) {
         (Some(id), _) => format!("scanning {id}"),
+        (None, RigState::Busy) if let Some(id) = &snapshot.calibrating => format!("calibrating {id}"),
         (None, RigState::Connecting) => "opening the rig".to_owned(),
         (None, RigState::Fault) => {
             format!("cannot scan: {}", snapshot.rig.message.clone().unwrap_or_default())

@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
-use super::state::State;
+use super::{calibration::CalibrationKind, state::State};
 
 /// Captures whose frames may be in memory while the next scan is captured: one being decoded, one waiting for it.
 pub const MOST_FINISHING: usize = 2;
@@ -31,15 +31,18 @@ impl Obstacle {
 /// Who has the rig.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct Holder {
-    /// The scan.
+    /// The scan, or the calibration.
     pub id: String,
-    /// Where it is.
+    /// Where it is; a calibration is always `projecting`.
     pub state: State,
     /// Its name for a person.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub label: Option<String>,
     /// When it was accepted, RFC 3339.
     pub created: String,
+    /// What is calibrated, where it is no scan.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub calibration: Option<CalibrationKind>,
 }
 
 /// What admission looks at.
@@ -122,7 +125,13 @@ mod tests {
     use super::*;
 
     fn holder(id: &str) -> Holder {
-        Holder { id: id.to_owned(), state: State::Projecting, label: None, created: String::new() }
+        Holder {
+            id: id.to_owned(),
+            state: State::Projecting,
+            label: None,
+            created: String::new(),
+            calibration: None,
+        }
     }
 
     prop_compose! {

@@ -20,6 +20,7 @@
 //! [`MOST_FINISHING`] captures are in memory besides those that are being taken.
 
 mod admission;
+mod calibration;
 mod disk;
 mod events;
 mod finish;
@@ -37,10 +38,11 @@ mod state;
 pub use admission::{
     Ask, Decision, Holder, MOST_FINISHING, MOST_REPEATS, Obstacle, Refusal, Situation, admit,
 };
+pub use calibration::{CalibrationKind, CalibrationRecord, CalibrationState, LiveValue};
 pub use events::EventLog;
 pub use heartbeat::Heartbeat;
 pub use metrics::Metrics;
-pub use owner::{Change, Denied, Submit};
+pub use owner::{CalibrationAsk, Change, Denied, Submit};
 pub use preview::{Exposure, Picture, Preview};
 pub use record::{Cause, Progress, Record, Series, is_id};
 pub use service::{Scanner, Threads, start};

@@ -45,6 +45,12 @@ impl Prepared {
         Ok(Self { mode, exposure_us, calibration_changed, stale: false, scan, applied })
     }
 
+    /// Sets the camera again after it was used for something else.
+    pub fn restore(&mut self, base: &Settings, rig: &mut Rig) -> Result<(), Failure> {
+        self.stale = true;
+        self.renew(base, self.mode, self.exposure_us, rig)
+    }
+
     /// Prepares anew where the last preparation was for something else.
     pub fn renew(
         &mut self,

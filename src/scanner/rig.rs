@@ -1,6 +1,8 @@
 //! The thread that owns the rig: opens it, and opens it again after a failure; captures scans; holds pictures; takes
 //! single frames for the preview. Nothing else ever touches a device.
 
+pub mod calibrate;
+
 use std::{
     panic::{AssertUnwindSafe, catch_unwind},
     path::PathBuf,
@@ -73,6 +75,8 @@ pub struct Job {
 pub enum Command {
     /// Capture a scan.
     Scan(Box<Job>),
+    /// Calibrate.
+    Calibrate(Box<calibrate::Job>),
     /// Hold a picture, which is called this.
     Show(Shown, String, Reply<()>),
     /// Take a frame for the preview.
@@ -155,6 +159,13 @@ pub enum News {
         /// Who asked for it.
         reply: Reply<()>,
     },
+    /// A calibration goes on or has come to its end.
+    Calibration {
+        /// Calibration.
+        id: String,
+        /// What it tells.
+        said: calibrate::Said,
+    },
     /// The frame for the preview has been taken, or not.
     Previewed,
 }
@@ -216,6 +227,7 @@ pub fn run(shared: &Shared, commands: &Receiver<Command>) {
                 open.as_mut().and_then(|rig| rig.alive().err()).map(|error| error.to_string()).inspect(down)
             }
             (Ok(Command::Scan(job)), Some(rig)) => rig.scan(shared, *job),
+            (Ok(Command::Calibrate(job)), Some(rig)) => rig.calibrate(shared, &job),
             (Ok(Command::Show(shown, name, reply)), Some(rig)) => {
                 let held = rig.show(shared, shown);
                 let broken = held.as_ref().err().and_then(broken_by);
@@ -282,6 +294,10 @@ fn refuse(shared: &Shared, command: Command) {
     match command {
         Command::Scan(job) => shared.tell(News::Refused { id: job.label.id, failure }),
         Command::Show(_, name, reply) => shared.tell(News::Shown { name, held: Err(failure), reply }),
+        Command::Calibrate(job) => {
+            let said = calibrate::Said::Ended(Err(failure.into()));
+            shared.tell(News::Calibration { id: job.id, said });
+        }
         Command::Preview => shared.tell(News::Previewed),
     }
 }

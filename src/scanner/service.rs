@@ -13,8 +13,10 @@ use std::{
 use tokio::sync::{oneshot, watch};
 
 use super::{
-    EventLog, Heartbeat, Metrics, Preview, Record, Snapshot, disk, finish,
-    owner::{Change, Denied, Message, Outlets, Owner, Submit},
+    EventLog, Heartbeat, Metrics, Preview, Record, Snapshot,
+    calibration::CalibrationRecord,
+    disk, finish,
+    owner::{CalibrationAsk, Change, Denied, Message, Outlets, Owner, Submit},
     rig,
 };
 use crate::{
@@ -89,6 +91,7 @@ pub fn start(settings: Settings, library: Library, index: Index) -> std::io::Res
         events: scanner.events.clone(),
         metrics: scanner.metrics.clone(),
         heartbeat: scanner.heartbeats[0].clone(),
+        rig_heartbeat: scanner.heartbeats[1].clone(),
     };
     let owner = Owner::new(settings, library, index, outlets);
     let spawn = |name: &str, run: Box<dyn FnOnce() + Send>| Builder::new().name(name.to_owned()).spawn(run);
@@ -147,6 +150,16 @@ impl Scanner {
     /// Holds all queued scans back, or releases them; answers how many that were.
     pub async fn hold(&self, held: bool) -> Result<usize, Denied> {
         self.ask(|reply| Message::Hold(held, reply)).await
+    }
+
+    /// Asks for a calibration, which begins at once or is refused.
+    pub async fn calibrate(&self, ask: CalibrationAsk) -> Result<Arc<CalibrationRecord>, Denied> {
+        self.ask(|reply| Message::Calibrate(Box::new(ask), reply)).await
+    }
+
+    /// Stops a calibration.
+    pub async fn cancel_calibration(&self, id: &str) -> Result<Arc<CalibrationRecord>, Denied> {
+        self.ask(|reply| Message::CancelCalibration(id.to_owned(), reply)).await
     }
 
     /// Holds a picture; `name` is what the status calls it.

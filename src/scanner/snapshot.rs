@@ -6,7 +6,7 @@ use polscan_drivers::{camera::CameraInfo, projector::ProjectorInfo};
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
-use super::{admission::Obstacle, record::Record};
+use super::{admission::Obstacle, calibration::CalibrationRecord, record::Record};
 
 /// State of the rig's devices.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
@@ -17,7 +17,7 @@ pub enum RigState {
     Connecting,
     /// Open and idle.
     Ready,
-    /// Capturing.
+    /// Capturing or calibrating.
     Busy,
     /// Not there, or failed; it is tried again.
     Fault,
@@ -62,6 +62,10 @@ pub struct Snapshot {
     pub scans: BTreeMap<String, Arc<Record>>,
     /// The scan that has the rig.
     pub capturing: Option<String>,
+    /// The calibration that has the rig.
+    pub calibrating: Option<String>,
+    /// All calibrations.
+    pub calibrations: Arc<BTreeMap<String, Arc<CalibrationRecord>>>,
     /// Scans that are being decoded or wait for it, the oldest first.
     pub finishing: Vec<String>,
     /// Scans that wait for the rig, in order.

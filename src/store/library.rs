@@ -6,6 +6,7 @@
 //!                          every change
 //! DIR/ID.partial/          a bundle that is being written
 //! DIR/.spool/ID/           frames of a scan that is being captured
+//! DIR/.calibrations/       calibrations that the service made
 //! DIR/.trash/ID/           a bundle that is being deleted
 //! DIR/index.sqlite         the index
 //! DIR/.lock                held by the one process that writes here
@@ -18,7 +19,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use super::{bundle, error::StorageError, index, manifest, spool::Spooled};
+use super::{bundle, calibrations::Calibrations, error::StorageError, index, manifest, spool::Spooled};
 use crate::{
     engine::Failure,
     report::{Diagnosis, Reason, Report},
@@ -126,6 +127,11 @@ impl Library {
             Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
             Err(error) => Err(fail(error)),
         }
+    }
+
+    /// The calibrations of the service.
+    pub fn calibrations(&self) -> Calibrations {
+        Calibrations::of(&self.folder)
     }
 
     /// Free bytes on the disk of the store; `None` where it does not tell.

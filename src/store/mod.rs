@@ -1,6 +1,7 @@
 //! Bundles: one scan in one folder. Reading is strict and reports every fault; writing is all or nothing.
 
 pub mod bundle;
+pub mod calibrations;
 mod disk;
 pub mod error;
 pub mod frames;

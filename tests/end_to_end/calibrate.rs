@@ -131,41 +131,12 @@ fn ripple_of_the_lamp_is_found() {
     assert!((number(&file, "timing.settling_ms") - 6.0 / 9f64.ln() * 1000f64.ln()).abs() < 4.0, "{file}");
 }
 
-/// A plate of metal that scatters nothing, and a white card beside it.
-const COUPON: &str = r#"
-[materials.mirror]
-index = [0.96, 6.7]
-roughness = 0.45
-
-[materials.paper]
-diffuse = 0.8
-
-[[objects]]
-name = "coupon"
-material = "mirror"
-level = 0.7
-shape = { plane = { point_mm = [0.0, 0.0, 1000.0], normal = [0.05, 0.02, -1.0] } }
-
-[[objects]]
-name = "card"
-material = "paper"
-level = 0.5
-shape = { plane = { point_mm = [0.0, 0.0, 980.0], normal = [0.05, 0.02, -1.0], x_mm = [60.0, 140.0], y_mm = [-80.0, 80.0] } }
-"#;
-
-/// The rig before [`COUPON`], a fifth of its size.
-fn coupon_rig() -> Rig {
-    let rig = Rig::scaled(5.0).set("sim.scene", "coupon.toml");
-    std::fs::write(rig.path("coupon.toml"), COUPON).expect("the scene is written");
-    rig
-}
-
 #[test]
 fn polarization_is_found_from_three_angles_and_guards_scans() {
     let (error_deg, shift) = (1.7, [[0.31, -0.22], [0.0, 0.0], [0.31, -0.22]]);
     let extinction = [30.0, 50.0, 70.0];
     let shifts: Vec<Vec<f64>> = shift.iter().map(|shift| shift.to_vec()).collect();
-    let mut rig = coupon_rig()
+    let mut rig = Rig::coupon()
         .set("sim.projector.extinction", extinction.to_vec())
         .set("sim.projector.panel_shift_px", shifts)
         .set("rig.extinction_ratio", 0.0)
@@ -219,7 +190,7 @@ fn polarization_is_found_from_three_angles_and_guards_scans() {
 
 #[test]
 fn a_polarizer_that_is_far_off_and_surfaces_that_scatter_are_refused() {
-    let mut rig = coupon_rig().set("camera.exposure_us", 1000.0);
+    let mut rig = Rig::coupon().set("camera.exposure_us", 1000.0);
     for (out, angle) in [("a", 90.0), ("b", 45.0)] {
         rig = rig.set("sim.analyser.azimuth_error_deg", 8.0 + angle);
         calibrate(&rig, "polarization", out, &["--angle", &angle.to_string()]).expect(0);

@@ -9,6 +9,28 @@ use std::{
 use serde_json::Value;
 use toml::Table;
 
+/// A plate of metal that scatters nothing, and a white card beside it.
+const COUPON: &str = r#"
+[materials.mirror]
+index = [0.96, 6.7]
+roughness = 0.45
+
+[materials.paper]
+diffuse = 0.8
+
+[[objects]]
+name = "coupon"
+material = "mirror"
+level = 0.7
+shape = { plane = { point_mm = [0.0, 0.0, 1000.0], normal = [0.05, 0.02, -1.0] } }
+
+[[objects]]
+name = "card"
+material = "paper"
+level = 0.5
+shape = { plane = { point_mm = [0.0, 0.0, 980.0], normal = [0.05, 0.02, -1.0], x_mm = [60.0, 140.0], y_mm = [-80.0, 80.0] } }
+"#;
+
 /// A configuration that a test may change before it runs the program.
 pub struct Rig {
     folder: tempfile::TempDir,
@@ -19,6 +41,13 @@ impl Rig {
     /// The paper's rig, a quarter of its size.
     pub fn small() -> Self {
         Self::scaled(4.0)
+    }
+
+    /// The rig before [`COUPON`], a fifth of its size.
+    pub fn coupon() -> Self {
+        let rig = Self::scaled(5.0).set("sim.scene", "coupon.toml");
+        fs::write(rig.path("coupon.toml"), COUPON).expect("the scene is written");
+        rig
     }
 
     /// The paper's rig with sizes and focal lengths divided by `scale`: the same camera pixels see one projector pixel.
@@ -44,10 +73,15 @@ impl Rig {
 
     /// Sets a key such as `sim.camera.bits`.
     pub fn set(mut self, key: &str, value: impl Into<toml::Value>) -> Self {
+        self.change(key, value);
+        self
+    }
+
+    /// Sets a key of the configuration.
+    pub fn change(&mut self, key: &str, value: impl Into<toml::Value>) {
         let (path, name) = key.rsplit_once('.').expect("a key has a table");
         let path: Vec<&str> = path.split('.').collect();
         at(&mut self.config, &path).insert(name.into(), value.into());
-        self
     }
 
     /// Leaves a table such as `sim` out.

@@ -1,5 +1,6 @@
 //! The service from outside: a real process on a small twin, spoken to over its socket.
 
+mod calibrations;
 mod client;
 mod daemon;
 mod kills;

@@ -53,6 +53,25 @@ fn wrong_requests_get_problems_that_say_what_is_wrong() {
     daemon.request("PUT", "/v1/projector", &json!({ "show": "unicorn" })).expect(422);
     assert_eq!(daemon.post("/v1/calibrations/rig", &json!({})).expect(501).slug(), "not-implemented");
     daemon.post("/v1/calibrations/odd", &json!({})).expect(404);
+    daemon.post("/v1/calibrations/odd/cancel", &json!({})).expect(404);
+    daemon.get("/v1/calibrations/odd").expect(404);
+    daemon.get("/v1/calibrations/odd/report.json").expect(404);
+    for body in [
+        json!({ "angle_deg": 1000 }),
+        json!({ "with": ["nobody"] }),
+        json!({ "coupon": "everywhere" }),
+        json!({ "card": "card=0,0,1,1" }),
+        json!({ "watch_s": 0 }),
+        json!({ "speed": 1 }),
+    ] {
+        assert_eq!(
+            daemon.post("/v1/calibrations/polarization", &body).expect(422).slug(),
+            "invalid",
+            "{body}"
+        );
+    }
+    daemon.post("/v1/calibrations/noise", &json!({ "speed": 1 })).expect(422);
+    assert_eq!(daemon.get("/v1/calibrations").json()["runs"], json!([]));
     // Nothing of all this was a scan.
     assert!(daemon.get("/v1/scans").json()["scans"].as_array().unwrap().is_empty());
     nothing_at_error_level(&daemon);

@@ -4,11 +4,10 @@ use std::path::PathBuf;
 
 use super::{
     board,
-    output::Output,
     result::{self, Subject},
     views::{Views, name_of, read_picture},
 };
-use crate::{calibration::boards::DetectSettings, engine::Failure};
+use crate::{calibrate::Output, calibration::boards::DetectSettings, engine::Failure};
 
 /// Arguments.
 #[derive(Debug, clap::Args)]

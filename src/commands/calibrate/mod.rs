@@ -2,21 +2,22 @@
 
 mod board;
 mod camera;
-mod noise;
 mod output;
 mod pictures;
 mod polarization;
 mod result;
 mod rig;
 mod session;
-mod sync;
 mod views;
 
 use clap::Subcommand;
 
 use crate::{
+    app::Rig,
+    calibrate::{Outcome, Output, noise, sync},
     config::{ConfigError, Settings},
     engine::Failure,
+    sequencer::CancelFlag,
 };
 
 /// What to calibrate.
@@ -46,8 +47,19 @@ pub fn calibrate(
         Calibrate::Board(args) => board::run(args, json),
         Calibrate::Camera(args) => camera::run(args, json),
         Calibrate::Rig(args) => rig::run(args, load, json),
-        Calibrate::Noise(args) => noise::run(args, &load(args.config.as_deref())?, json),
+        Calibrate::Noise(args) => plain(args, &load(args.config.as_deref())?, json, noise::run),
         Calibrate::Polarization(args) => polarization::run(args, &load(args.config())?, json),
-        Calibrate::Sync(args) => sync::run(args, &load(args.config.as_deref())?, json),
+        Calibrate::Sync(args) => plain(args, &load(args.config.as_deref())?, json, sync::run),
     }
+}
+
+/// A calibration that needs no arguments of its own.
+type Plain = fn(Output, &mut Rig, &Settings, &CancelFlag, &mut dyn FnMut(&str)) -> Result<Outcome, Failure>;
+
+/// Runs it; returns the exit code.
+fn plain(place: &output::Place, settings: &Settings, json: bool, run: Plain) -> Result<u8, Failure> {
+    let folder = Output::create(&place.out)?;
+    let outcome =
+        output::with_rig(settings, |rig, cancel, progress| run(folder, rig, settings, cancel, progress))?;
+    Ok(output::print(&place.out, &outcome, json))
 }

@@ -1,36 +1,21 @@
 //! `polscan calibrate polarization`.
 
-use std::{
-    path::{Path, PathBuf},
-    time::SystemTime,
-};
+use std::path::{Path, PathBuf};
 
-use polscan_calibration::polarization::{
-    CHANNEL_NAMES, Found, PolarizationError, State, Turn, Turning, solve,
-};
-use serde_json::{Value, json};
+use polscan_calibration::polarization::Turning;
 
-use super::output::{Output, Place, Summary, series, with_rig};
+use super::output::{Place, print, with_rig};
 use crate::{
-    compare::plot::Plot,
+    calibrate::{
+        Output,
+        polarization::{Task, read_set, run as calibrate, turning_advice},
+    },
     config::Settings,
     engine::Failure,
-    measure::{
-        files::{DeviceKey, Document, PolarizationFile},
-        polarization::{Measured, Set, Task, measure, watch},
-    },
+    measure::polarization::watch,
     report::NamedRegion,
     sequencer::CancelFlag,
-    store::{Policy, source::read_bounded, time::rfc3339_utc},
 };
-
-/// Edges are looked at where the polarizer lets H pass.
-const EDGES_WITHIN_DEG: f64 = 20.0;
-/// A polarizer farther off is to be turned, and measured again.
-const MOST_ERROR_DEG: f64 = 5.0;
-/// No report of a measurement is longer.
-const MAX_REPORT_BYTES: u64 = 4 << 20;
-const CLASSES: [&str; 3] = ["raw", "pse", "paper"];
 
 /// Arguments of `polscan calibrate polarization`.
 #[derive(Debug, clap::Args)]
@@ -66,47 +51,18 @@ impl Args {
 
 /// Measures one angle, joins it with those of earlier runs, and writes; returns the exit code.
 pub fn run(args: &Args, settings: &Settings, json: bool) -> Result<u8, Failure> {
-    let earlier = args.with.iter().map(|folder| read_set(folder)).collect::<Result<Vec<Set>, Failure>>()?;
-    let mut output = Output::create(&args.place.out)?;
-    let task = Task {
-        angle_deg: args.angle,
-        coupon: args.coupon.as_ref(),
-        card: args.card.as_ref(),
-        edges: args.angle.abs() <= EDGES_WITHIN_DEG,
-    };
-    let measured = with_rig(settings, |rig, cancel, progress| {
+    let earlier = args.with.iter().map(|folder| read_set(folder)).collect::<Result<_, Failure>>()?;
+    let output = Output::create(&args.place.out)?;
+    let task = Task { angle_deg: args.angle, earlier, coupon: args.coupon.clone(), card: args.card.clone() };
+    let outcome = with_rig(settings, |rig, cancel, progress| {
         if !args.watch {
-            return measure(rig, settings, &task, cancel, progress);
+            return calibrate(output, rig, settings, &task, cancel, progress);
         }
-        follow(args.values, |seen| watch(rig, settings, task.coupon, cancel, seen))?;
+        follow(args.values, |seen| watch(rig, settings, task.coupon.as_ref(), cancel, seen))?;
         // The interrupt ended the watch; a second one ends the program.
-        measure(rig, settings, &task, &CancelFlag::default(), progress)
+        calibrate(output, rig, settings, &task, &CancelFlag::default(), progress)
     })?;
-    let sets: Vec<&Set> = earlier.iter().chain([&measured.set]).collect();
-    let turns: Vec<Turn> = sets.iter().map(|set| set.turn).collect();
-    let found = solve(&turns);
-    let refused = match &found {
-        Ok(found) => refusal(found),
-        // A first angle is no failure: the others follow.
-        Err(PolarizationError::Turns(_)) => None,
-        Err(error) => Some(error.to_string()),
-    };
-    if let (Ok(found), None) = (&found, &refused) {
-        output.document(&file(found, &measured, &sets))?;
-    }
-    output.plot("turns.svg", &plot(&turns, found.as_ref().ok()))?;
-    let report = json!({
-        "schema": "polscan.polarization-report/1",
-        "set": measured.set,
-        "turns": turns,
-        "found": found.as_ref().ok(),
-        "message": found.as_ref().err().map(ToString::to_string),
-        "misregistration": measured.field,
-        "drive": measured.drive,
-    });
-    let lines = lines(&measured, found.as_ref());
-    let refused = refused.into_iter().collect();
-    output.finish(&args.place.out, &report, &Summary { lines, refused }, json)
+    Ok(print(&args.place.out, &outcome, json))
 }
 
 /// Prints each value of a watch, and how far off the polarizer stands.
@@ -118,163 +74,9 @@ fn follow(
     let mut count = 0;
     watch(&mut |h, v| {
         count += 1;
-        let off = turning.add(v);
-        let advice = match off {
-            Some(angle) if angle < 0.5 => "V is as dark as it was seen: stop here".to_owned(),
-            Some(angle) => format!("{angle:4.1} degrees off the darkest V that was seen"),
-            None => "turn the polarizer through a quarter turn".to_owned(),
-        };
+        let advice = turning_advice(turning.add(v));
         // Values of a watch are for eyes: stdout stays one object for scripts.
         eprintln!("H {h:8.1} DN  V {v:8.1} DN  H/V {:7.2}  {advice}", h / v.max(1e-9));
         values.is_none_or(|values| count < values)
     })
-}
-
-/// The set of an earlier run.
-fn read_set(folder: &Path) -> Result<Set, Failure> {
-    let path = folder.join("report.json");
-    let operation = || format!("use the earlier run {}", folder.display());
-    let bytes = read_bounded(&path, Policy::Local, "read", MAX_REPORT_BYTES)
-        .map_err(|error| Failure::data(operation(), error))?;
-    let report: Value = serde_json::from_slice(&bytes).map_err(|error| Failure::data(operation(), error))?;
-    serde_json::from_value(report["set"].clone()).map_err(|error| Failure::data(operation(), error))
-}
-
-/// Why a rig is not to be used as it stands.
-fn refusal(found: &Found) -> Option<String> {
-    let none: Vec<&str> = (0..3)
-        .filter(|&index| found.channels[index].state == State::None)
-        .map(|index| CHANNEL_NAMES[index])
-        .collect();
-    if !none.is_empty() {
-        return Some(format!(
-            "{} is not polarized: it cannot carry a code; leave it out of projector.horizontal and projector.vertical, or \
-             measure on bare metal",
-            none.join(" and ")
-        ));
-    }
-    if letters(found, State::Horizontal).is_empty() || letters(found, State::Vertical).is_empty() {
-        return Some(
-            "all channels carry the same state: this projector cannot show a polarization code".into(),
-        );
-    }
-    (found.azimuth_error_deg.abs() > MOST_ERROR_DEG).then(|| {
-        format!(
-            "the polarizer's axis is {:.1} degrees off H where its mount reads 0: {}, call that 0, and measure again",
-            found.azimuth_error_deg,
-            turn_advice(found)
-        )
-    })
-}
-
-/// What to do with the mount.
-fn turn_advice(found: &Found) -> String {
-    let error = found.azimuth_error_deg;
-    let way = if error > 0.0 { "clockwise" } else { "counter-clockwise" };
-    format!("turn it to {:.1} degrees, {:.1} degrees {way} as the camera sees it", -error, error.abs())
-}
-
-fn letters(found: &Found, state: State) -> String {
-    (0..3).filter(|&index| found.channels[index].state == state).map(|index| ["r", "g", "b"][index]).collect()
-}
-
-fn file(found: &Found, measured: &Measured, sets: &[&Set]) -> PolarizationFile {
-    let best = sets.iter().map(|set| set.h_over_v()).fold(0.0, f64::max);
-    let brightest = sets.iter().map(|set| set.white).fold(1e-9, f64::max);
-    let black = sets.iter().map(|set| set.black).fold(0.0, f64::max);
-    PolarizationFile {
-        schema: PolarizationFile::SCHEMA.into(),
-        created: rfc3339_utc(SystemTime::now()),
-        horizontal: letters(found, State::Horizontal),
-        vertical: letters(found, State::Vertical),
-        extinction_ratio: best,
-        azimuth_error_deg: found.azimuth_error_deg,
-        azimuth_sigma_deg: found.azimuth_sigma_deg,
-        black_share: black / brightest,
-        camera: DeviceKey::from(&measured.camera),
-        projector: DeviceKey::from(&measured.projector),
-        drive: measured.drive,
-        misregistration: measured.field,
-        channels: found.channels,
-    }
-}
-
-fn lines(measured: &Measured, found: Result<&Found, &PolarizationError>) -> Vec<String> {
-    let set = &measured.set;
-    let [red, green, blue] = set.turn.light;
-    let mut lines = vec![format!(
-        "at {:.1} degrees: red {red:.1}, green {green:.1}, blue {blue:.1} DN; H over V {:.2}; panels {:.2} % off adding up",
-        set.turn.angle_deg,
-        set.h_over_v(),
-        100.0 * set.crosstalk
-    )];
-    match found {
-        Ok(found) => {
-            for (name, channel) in CHANNEL_NAMES.iter().zip(&found.channels) {
-                let state = match channel.state {
-                    State::Horizontal => "H",
-                    State::Vertical => "V",
-                    State::None => "neither",
-                };
-                lines.push(format!(
-                    "{name:6} carries {state}: extinction {:.1} +- {:.1}, that is a leakage of {:.2} %; axis {:.2} +- {:.2} degrees",
-                    channel.extinction,
-                    channel.extinction_sigma,
-                    100.0 / channel.extinction,
-                    channel.axis_deg,
-                    channel.axis_sigma_deg
-                ));
-            }
-            lines.push(format!(
-                "polarizer {:.2} +- {:.2} degrees off; {}",
-                found.azimuth_error_deg,
-                found.azimuth_sigma_deg,
-                turn_advice(found)
-            ));
-        }
-        Err(error) => lines.push(error.to_string()),
-    }
-    if let Some(field) = &measured.field {
-        let [x, y] = field.at(0.5 * f64::from(field.size[0]) - 0.5, 0.5 * f64::from(field.size[1]) - 0.5);
-        lines.push(format!(
-            "V lies {x:+.3}, {y:+.3} px off H in the middle of the picture (sigma {:.3}, {:.3}), {:.3} px at most",
-            field.sigma_px[0],
-            field.sigma_px[1],
-            field.largest_px()
-        ));
-    }
-    if let Some(drive) = &measured.drive {
-        lines.push(format!(
-            "the card returns H {:.2} times as bright as V; alike at codes H {} and V {}",
-            drive.ratio_at_full, drive.horizontal, drive.vertical
-        ));
-    }
-    lines
-}
-
-/// Light of each channel over the angle, with what Malus' law makes of it.
-fn plot(turns: &[Turn], found: Option<&Found>) -> Plot {
-    let mut all = Vec::new();
-    for (index, class) in CLASSES.into_iter().enumerate() {
-        let most = turns.iter().map(|turn| turn.light[index]).fold(1e-9, f64::max);
-        let points = turns.iter().map(|turn| (turn.angle_deg, turn.light[index] / most)).collect();
-        all.push(series(CHANNEL_NAMES[index], class, false, points));
-        if let Some(channel) = found.map(|found| found.channels[index]) {
-            let malus = |angle: f64| {
-                let cos = (2.0 * (angle - channel.axis_deg).to_radians()).cos();
-                0.5 * (channel.extinction * (1.0 + cos) + 1.0 - cos) / channel.extinction
-            };
-            let sum: f64 = turns.iter().map(|turn| turn.light[index] / malus(turn.angle_deg)).sum();
-            let top = sum / turns.len() as f64 / most;
-            let curve = (-90..=180).step_by(3).map(|angle| (f64::from(angle), top * malus(f64::from(angle))));
-            all.push(series("", class, true, curve.collect()));
-        }
-    }
-    Plot {
-        label: "light of each channel over the angle of the polarizer".into(),
-        x_name: "reading of the mount in degrees".into(),
-        y_name: "light, brightest = 1".into(),
-        series: all,
-        ..Plot::default()
-    }
 }

@@ -7,12 +7,9 @@ use std::{
 
 use serde_json::{Value, json};
 
-use super::{
-    output::{Output, Summary},
-    pictures,
-    views::Views,
-};
+use super::{output::print, pictures, views::Views};
 use crate::{
+    calibrate::{Output, Summary},
     calibration::{
         boards::Board,
         rig::{Calibrated, Gates, Refused, Setup, calibrate, guidance},
@@ -97,7 +94,8 @@ pub fn solve(subject: &Subject<'_>, mut output: Output, out: &Path, json: bool) 
         true => lines.push("accepted".into()),
         false => lines.extend(missing.missing.iter().map(|missing| format!("missing: {missing}"))),
     }
-    output.finish(out, &report, &Summary { lines, refused }, json)
+    let outcome = output.finish(report, Summary { lines, refused, ..Summary::default() })?;
+    Ok(print(out, &outcome, json))
 }
 
 fn dated(calibrated: &Calibrated) -> Calibration {

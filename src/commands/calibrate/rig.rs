@@ -9,13 +9,13 @@ use polscan_patterns::Mode;
 
 use super::{
     board,
-    output::Output,
     result::{self, Subject, setup},
     session::Session,
     views::{Views, name_of, white_picture},
 };
 use crate::{
     app::{Rig, holding},
+    calibrate::Output,
     calibration::{
         boards::{Board, DetectSettings},
         rig::{Gates, guidance},

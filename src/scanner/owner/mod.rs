@@ -4,6 +4,8 @@
 //! What it decides by is in `admission`, `state` and `record`; here is the loop, what goes to the rig, and how a record
 //! changes. `requests`, `news` and `room` have the rest.
 
+mod calibrations;
+mod message;
 mod news;
 mod requests;
 mod room;
@@ -19,10 +21,11 @@ use std::{
 };
 
 use polscan_patterns::Mode;
-use tokio::sync::{oneshot, watch};
+use tokio::sync::watch;
 
 use super::{
     admission::{self, Ask, Decision, Holder, Obstacle, Refusal, Situation},
+    calibration::CalibrationRecord,
     disk,
     events::{BLOCK, EventLog, IN_INDEX},
     finish::{self, Broken, Work},
@@ -57,95 +60,12 @@ const RECENT: usize = 64;
 
 const GIB: f64 = (1u64 << 30) as f64;
 
-/// A request for scans.
-#[derive(Debug, Clone)]
-pub struct Submit {
-    /// Mode; the configured one where there is none.
-    pub mode: Option<Mode>,
-    /// Exposure in microseconds; the configured one where there is none.
-    pub exposure_us: Option<f64>,
-    /// Name for a person.
-    pub label: Option<String>,
-    /// Tags.
-    pub tags: Vec<String>,
-    /// Number of scans.
-    pub repeat: usize,
-    /// Whether they may wait.
-    pub queue: bool,
-    /// Frames of this scan are decoded again, without the rig.
-    pub source: Option<String>,
-    /// Key of the client and digest of its request.
-    pub key: Option<(String, String)>,
-}
-
-/// Why a request was not carried out.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Denied {
-    /// By the rules of admission.
-    Refused(Refusal),
-    /// The key was used for another request.
-    KeyReused,
-    /// There is no such scan.
-    Unknown,
-    /// The scan is in a state that does not allow it.
-    State(State),
-    /// It is pinned.
-    Pinned,
-    /// Another scan was decoded from its frames.
-    InUse,
-    /// It has no bundle.
-    NoBundle,
-    /// The disk says no.
-    Storage(String),
-    /// The rig says no.
-    Rig(String),
-}
-
-/// A change of what a person may change.
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct Change {
-    /// New name; `Some(None)` removes it.
-    pub label: Option<Option<String>>,
-    /// New tags.
-    pub tags: Option<Vec<String>>,
-    /// Whether retention leaves it alone.
-    pub pinned: Option<bool>,
-}
-
-/// An answer to whoever asked.
-pub type Reply<T> = oneshot::Sender<Result<T, Denied>>;
-
-/// Gives an answer.
-type Answer = Box<dyn FnOnce()>;
-
-fn answer<T: 'static>(result: Result<T, Denied>, reply: Reply<T>) -> Answer {
-    Box::new(move || drop(reply.send(result)))
-}
-
-/// What comes in.
-#[derive(Debug)]
-pub enum Message {
-    /// A request for scans; answered with all of them, and whether the answer is an earlier one's.
-    Submit(Box<Submit>, Reply<(Vec<Arc<Record>>, bool)>),
-    /// Stop a scan.
-    Cancel(String, Reply<Arc<Record>>),
-    /// Delete a scan.
-    Delete(String, Reply<()>),
-    /// Change label, tags or pin.
-    Change(String, Change, Reply<Arc<Record>>),
-    /// Hold all queued scans back, or release them.
-    Hold(bool, Reply<usize>),
-    /// Hold a picture.
-    Show(Shown, String, Reply<()>),
-    /// Take a frame for the preview, if that disturbs nobody.
-    Preview,
-    /// End, after the scan that is running or this time.
-    Stop(Duration),
-    /// From the rig.
-    Rig(rig::News),
-    /// From the finisher.
-    Finish(finish::News),
-}
+pub use calibrations::CalibrationAsk;
+pub use message::{Change, Denied, Message, Reply, Submit};
+use {
+    calibrations::Calibrating,
+    message::{Answer, answer},
+};
 
 /// A scan that waits.
 #[derive(Debug)]
@@ -172,6 +92,8 @@ pub struct Outlets {
     pub metrics: Arc<Metrics>,
     /// Signs of life.
     pub heartbeat: Arc<Heartbeat>,
+    /// Signs of life of the rig, while it measures.
+    pub rig_heartbeat: Arc<Heartbeat>,
 }
 
 /// The state.
@@ -189,6 +111,8 @@ pub struct Owner {
     accepted: BTreeMap<String, Instant>,
     /// Why captures that did not come to their end did not.
     cut_short: BTreeMap<String, Diagnosis>,
+    calibrating: Option<Calibrating>,
+    calibrations: Arc<BTreeMap<String, Arc<CalibrationRecord>>>,
     rig: RigStatus,
     storage: StorageStatus,
     storage_fault: Option<String>,
@@ -234,6 +158,8 @@ impl Owner {
             finishing: VecDeque::new(),
             accepted: BTreeMap::new(),
             cut_short: BTreeMap::new(),
+            calibrating: None,
+            calibrations: Arc::default(),
             rig: RigStatus::default(),
             storage,
             storage_fault: None,
@@ -248,6 +174,7 @@ impl Owner {
             owner.queue.push_back(Waiting { id: record.id.clone(), held, urgent: false });
             owner.scans.insert(record.id.clone(), Arc::new(record));
         }
+        owner.recall_calibrations();
         owner.number_queue();
         owner.housekeep();
         owner.publish();
@@ -258,6 +185,7 @@ impl Owner {
     pub fn run(mut self, messages: &Receiver<Message>) {
         loop {
             self.out.heartbeat.beat();
+            self.feel_calibration();
             match messages.recv_timeout(TICK) {
                 Ok(message) => self.handle(message),
                 Err(RecvTimeoutError::Timeout) => {}
@@ -271,7 +199,7 @@ impl Owner {
                 if self.stop_by.is_some_and(|limit| Instant::now() >= limit) {
                     self.cancel.values().for_each(CancelFlag::cancel);
                 }
-                if self.active.is_none() && self.finishing.is_empty() {
+                if self.active.is_none() && self.finishing.is_empty() && self.calibrating.is_none() {
                     break;
                 }
             }
@@ -291,6 +219,8 @@ impl Owner {
             Message::Delete(id, reply) => Some(answer(self.delete(&id), reply)),
             Message::Change(id, change, reply) => Some(answer(self.change(&id, change), reply)),
             Message::Hold(held, reply) => Some(answer(Ok(self.hold(held)), reply)),
+            Message::Calibrate(ask, reply) => Some(answer(self.calibrate(*ask), reply)),
+            Message::CancelCalibration(id, reply) => Some(answer(self.cancel_calibration(&id), reply)),
             Message::Show(shown, name, reply) => self.show(shown, name, reply),
             Message::Preview => {
                 self.preview();
@@ -433,6 +363,8 @@ impl Owner {
             revision: self.out.events.next() - 1,
             scans: self.scans.clone(),
             capturing: self.active.clone(),
+            calibrating: self.calibrating.as_ref().map(|one| one.id.clone()),
+            calibrations: self.calibrations.clone(),
             finishing,
             queue,
             rig: self.rig.clone(),

@@ -43,6 +43,7 @@ impl Owner {
                 let message = format!("a defect of this program: {message}");
                 self.end(&id, State::Failed, |record| record.blame("internal", message));
             }
+            rig::News::Calibration { id, said } => self.calibration_news(&id, said),
             rig::News::Previewed => self.previewing = false,
         }
         None
@@ -50,8 +51,8 @@ impl Owner {
 
     fn shown(&mut self, name: String, held: Result<(), Failure>, reply: Reply<()>) -> Answer {
         let held = held.map_err(|failure| Denied::Rig(failure.chain()));
-        // A scan that has begun meanwhile has taken the picture away.
-        if held.is_ok() && self.active.is_none() {
+        // A scan or a calibration that has begun meanwhile has taken the picture away.
+        if held.is_ok() && self.active.is_none() && self.calibrating.is_none() {
             self.rig.showing = (name != "black").then_some(name);
             let showing = self.rig.showing.clone();
             self.event("projector", |_| serde_json::json!({ "show": showing }).to_string());

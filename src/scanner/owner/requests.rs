@@ -115,7 +115,8 @@ impl Owner {
 
     pub(super) fn situation(&self) -> Situation {
         let next = self.next_holder().map(|waiting| waiting.id.as_str());
-        let holder = self.active.as_deref().or(next).and_then(|id| self.holder(id));
+        let scan = self.active.as_deref().or(next).and_then(|id| self.holder(id));
+        let holder = self.calibration_holder().or(scan);
         let runnable = self.queue.iter().filter(|waiting| !waiting.held).count();
         Situation {
             obstacles: self.obstacles(),
@@ -132,7 +133,7 @@ impl Owner {
     pub(super) fn holder(&self, id: &str) -> Option<Holder> {
         let record = self.scans.get(id)?;
         let Record { id, state, label, created, .. } = record.as_ref().clone();
-        Some(Holder { id, state, label, created })
+        Some(Holder { id, state, label, created, calibration: None })
     }
 
     pub(super) fn obstacles(&self) -> Vec<Obstacle> {
@@ -298,6 +299,8 @@ impl Owner {
     pub(super) fn stop(&mut self, grace: Duration) {
         self.stopping = true;
         self.stop_by = Some(Instant::now() + grace);
+        // A measurement has nothing that could be kept, and can be asked for again.
+        self.calibrating.iter().for_each(|one| one.cancel.cancel());
         // Decodes that have not begun can be asked for again; queued scans stay queued.
         tracing::info!(grace_s = grace.as_secs_f64(), "stopping");
     }

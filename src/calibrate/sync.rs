@@ -1,12 +1,13 @@
-//! `polscan calibrate sync`.
+//! Latency, rise and fall of the projector and ripple of its lamp: measured and written.
 
 use std::time::SystemTime;
 
 use polscan_calibration::synchrony::Sample;
 use serde_json::{Value, json};
 
-use super::output::{Output, Place, Summary, series, with_rig};
+use super::output::{Outcome, Output, Summary, series};
 use crate::{
+    app::Rig,
     compare::plot::Plot,
     config::Settings,
     engine::Failure,
@@ -14,27 +15,32 @@ use crate::{
         files::{Chosen, DeviceKey, DisplayMode, Document, SyncFile},
         sync::{Curve, Synchrony, measure},
     },
+    sequencer::CancelFlag,
     store::time::rfc3339_utc,
 };
 
 /// Colours of the bands' curves, from the top of the picture down.
 const CLASSES: [&str; 4] = ["raw", "paper", "pse", "truth"];
 
-/// Measures and writes; returns the exit code.
-pub fn run(place: &Place, settings: &Settings, json: bool) -> Result<u8, Failure> {
-    let mut output = Output::create(&place.out)?;
-    let found = with_rig(settings, |rig, cancel, progress| measure(rig, settings, cancel, progress))?;
+/// Measures and writes; `progress` hears what is being done.
+///
+/// # Errors
+/// Devices, a picture that the camera does not see, the disk, or `cancel`.
+pub fn run(
+    mut output: Output,
+    rig: &mut Rig,
+    settings: &Settings,
+    cancel: &CancelFlag,
+    progress: &mut dyn FnMut(&str),
+) -> Result<Outcome, Failure> {
+    let found = measure(rig, settings, cancel, progress)?;
     let file = file(&found);
     output.document(&file)?;
     for (name, plot) in plots(&found) {
         output.plot(&name, &plot)?;
     }
-    output.finish(
-        &place.out,
-        &report(&found, &file),
-        &Summary { lines: lines(&found, &file), refused: Vec::new() },
-        json,
-    )
+    let summary = Summary { lines: lines(&found, &file), ..Summary::default() };
+    output.finish(report(&found, &file), summary)
 }
 
 fn file(found: &Synchrony) -> SyncFile {

@@ -1,11 +1,12 @@
-//! `polscan calibrate noise`.
+//! Noise of the camera, by photon transfer: measured and written.
 
 use std::time::SystemTime;
 
 use serde_json::{Value, json};
 
-use super::output::{Output, Place, Summary, series, with_rig};
+use super::output::{Outcome, Output, Summary, series};
 use crate::{
+    app::Rig,
     compare::plot::Plot,
     config::Settings,
     engine::Failure,
@@ -13,16 +14,25 @@ use crate::{
         files::{DeviceKey, Document, NoiseFigures, NoiseFile, NoiseSettings},
         noise::{Measured, measure},
     },
+    sequencer::CancelFlag,
     store::time::rfc3339_utc,
 };
 
 /// Ill pixels that a report lists of each kind.
 const MOST_LISTED: usize = 200;
 
-/// Measures and writes; returns the exit code.
-pub fn run(place: &Place, settings: &Settings, json: bool) -> Result<u8, Failure> {
-    let mut output = Output::create(&place.out)?;
-    let measured = with_rig(settings, |rig, cancel, progress| measure(rig, settings, cancel, progress))?;
+/// Measures and writes; `progress` hears what is being done.
+///
+/// # Errors
+/// Devices, a picture without light, the disk, or `cancel`.
+pub fn run(
+    mut output: Output,
+    rig: &mut Rig,
+    settings: &Settings,
+    cancel: &CancelFlag,
+    progress: &mut dyn FnMut(&str),
+) -> Result<Outcome, Failure> {
+    let measured = measure(rig, settings, cancel, progress)?;
     let linearity = &measured.noise.linearity;
     let refused = (!linearity.linear).then(|| {
         format!(
@@ -37,12 +47,9 @@ pub fn run(place: &Place, settings: &Settings, json: bool) -> Result<u8, Failure
     for (name, plot) in plots(&measured) {
         output.plot(name, &plot)?;
     }
-    output.finish(
-        &place.out,
-        &report(&measured, &file),
-        &Summary { lines: lines(&measured), refused: refused.into_iter().collect() },
-        json,
-    )
+    let refused = refused.into_iter().collect();
+    let summary = Summary { lines: lines(&measured), refused, ..Summary::default() };
+    output.finish(report(&measured, &file), summary)
 }
 
 fn file(measured: &Measured) -> NoiseFile {

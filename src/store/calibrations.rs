@@ -1,0 +1,127 @@
+//! The calibrations that a service made: `.calibrations/ID.json` is what is known of one, `.calibrations/ID/` its files.
+
+use std::{
+    fs::{self, File},
+    io::{self, Write},
+    path::{Path, PathBuf},
+};
+
+use super::{bundle, error::StorageError};
+use crate::scanner::{CalibrationRecord, CalibrationState, is_id};
+
+/// Folder within a store.
+const FOLDER: &str = ".calibrations";
+
+/// Calibrations of a store.
+#[derive(Debug, Clone)]
+pub struct Calibrations(PathBuf);
+
+impl Calibrations {
+    /// Those of the store in `folder`.
+    pub fn of(folder: &Path) -> Self {
+        Self(folder.join(FOLDER))
+    }
+
+    /// Where the files of a calibration are or will be.
+    pub fn files(&self, id: &str) -> PathBuf {
+        debug_assert!(is_id(id), "{id}");
+        self.0.join(id)
+    }
+
+    /// Writes what is known of a calibration. All or nothing.
+    ///
+    /// # Errors
+    /// The disk says no.
+    pub fn write(&self, record: &CalibrationRecord) -> Result<(), StorageError> {
+        let (path, fresh) =
+            (self.0.join(format!("{}.json", record.id)), self.0.join(format!("{}.new", record.id)));
+        let write = || {
+            let json = serde_json::to_vec_pretty(record).map_err(io::Error::from)?;
+            fs::create_dir_all(&self.0)?;
+            let mut file = File::create(&fresh)?;
+            file.write_all(&json)?;
+            file.sync_all()?;
+            fs::rename(&fresh, &path)
+        };
+        write().map_err(|error| StorageError::file("write", &path, error))
+    }
+
+    /// All calibrations after a start: those that had not come to their end are `interrupted`, and keep no files.
+    ///
+    /// # Errors
+    /// The folder cannot be listed. A record that cannot be read is left out and logged.
+    pub fn recover(&self, now: &str) -> Result<Vec<CalibrationRecord>, StorageError> {
+        let fail = |error| StorageError::file("list", &self.0, error);
+        let entries = match fs::read_dir(&self.0) {
+            Ok(entries) => entries,
+            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
+            Err(error) => return Err(fail(error)),
+        };
+        if let Err(error) = bundle::remove_stale_partials(&self.0) {
+            tracing::warn!(%error, "what a calibration left still takes space");
+        }
+        let mut records = Vec::new();
+        for entry in entries {
+            let path = entry.map_err(fail)?.path();
+            if path.extension().is_none_or(|extension| extension != "json") {
+                continue;
+            }
+            match read(&path) {
+                Ok(record) if is_id(&record.id) => records.push(self.settle(record, now)),
+                Ok(_) => tracing::warn!(path = %path.display(), "the identity of a calibration is none"),
+                Err(error) => tracing::warn!(path = %path.display(), %error, "a calibration cannot be read"),
+            }
+        }
+        Ok(records)
+    }
+
+    fn settle(&self, mut record: CalibrationRecord, now: &str) -> CalibrationRecord {
+        if record.state.is_terminal() {
+            return record;
+        }
+        record.end(CalibrationState::Interrupted, now.to_owned());
+        record.blame("interrupted", "the service ended before the calibration did; start it again");
+        let files = self.files(&record.id);
+        if files.exists()
+            && let Err(error) = fs::remove_dir_all(&files)
+        {
+            tracing::warn!(%error, "what an interrupted calibration left still takes space");
+        }
+        if let Err(error) = self.write(&record) {
+            tracing::warn!(%error, "an interrupted calibration is not noted as such");
+        }
+        record
+    }
+}
+
+fn read(path: &Path) -> io::Result<CalibrationRecord> {
+    serde_json::from_slice(&fs::read(path)?).map_err(io::Error::from)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scanner::CalibrationKind;
+
+    #[test]
+    fn what_was_running_is_interrupted_and_what_had_ended_stays() {
+        let folder = tempfile::tempdir().unwrap();
+        let store = Calibrations::of(folder.path());
+        assert!(store.recover("now").unwrap().is_empty());
+        let running = CalibrationRecord::new("a".into(), CalibrationKind::Noise, "t".into());
+        let mut ended = CalibrationRecord::new("b".into(), CalibrationKind::Sync, "t".into());
+        ended.end(CalibrationState::Done, "then".into());
+        for record in [&running, &ended] {
+            store.write(record).unwrap();
+            fs::create_dir(store.files(&record.id)).unwrap();
+        }
+        fs::write(folder.path().join(FOLDER).join("c.json"), "{").unwrap();
+        let mut found = store.recover("now").unwrap();
+        found.sort_by(|a, b| a.id.cmp(&b.id));
+        let [first, second] = &found[..] else { panic!("{found:?}") };
+        assert_eq!((first.state, first.finished.as_deref()), (CalibrationState::Interrupted, Some("now")));
+        assert_eq!(second, &ended);
+        assert_eq!((store.files("a").exists(), store.files("b").exists()), (false, true));
+        assert_eq!(store.recover("later").unwrap().iter().find(|one| one.id == "a"), Some(first));
+    }
+}
