@@ -2,6 +2,7 @@
 //! single frames for the preview. Nothing else ever touches a device.
 
 pub mod calibrate;
+mod picture;
 
 use std::{
     panic::{AssertUnwindSafe, catch_unwind},
@@ -27,7 +28,7 @@ use super::{
 use crate::{
     app::Rig,
     config::Settings,
-    engine::{Failure, Label, Scan, Shown, Taken, hold, rig_failure},
+    engine::{Failure, Label, Scan, Shown, Taken, rig_failure},
     report::Diagnosis,
     sequencer::{CancelFlag, Progress},
     store::BundleWriter,
@@ -47,9 +48,6 @@ const TICK: Duration = Duration::from_millis(500);
 
 /// Test-only, and set by no unit: the label of scans in which the rig hangs for ever, as a driver that never returns does.
 const STALL_VARIABLE: &str = "POLSCAN_TEST_STALL";
-
-/// How long a frame for the preview is waited for, beyond its exposure.
-const PREVIEW_SLACK: Duration = Duration::from_millis(500);
 
 /// A scan to capture.
 #[derive(Debug)]
@@ -430,27 +428,5 @@ impl Open {
         self.tell_projector(shared);
         shared.metrics.stream(&self.rig.camera.info().serial, taken.statistics());
         Ok(Captured { scan, taken, writer, label: job.label })
-    }
-
-    fn show(&mut self, shared: &Shared, shown: Shown) -> Result<(), Failure> {
-        let Rig { projector, clock, .. } = &mut self.rig;
-        let held = hold(shown, &shared.settings, projector.as_mut(), clock.as_ref());
-        self.tell_projector(shared);
-        held
-    }
-
-    fn preview(&mut self, shared: &Shared) -> Result<(), DeviceError> {
-        let Rig { camera, clock, .. } = &mut self.rig;
-        camera.arm(1)?;
-        let exposure = Duration::from_secs_f64(1e-6 * self.prepared.applied.settings.exposure_us);
-        let taken = camera.trigger(clock.now()).and_then(|_| camera.next_frame(exposure + PREVIEW_SLACK));
-        let disarmed = camera.disarm();
-        match taken {
-            Ok(frame) => shared.preview.offer(&frame, &self.prepared.applied),
-            // One frame more or less does not matter here, nor one that lost a packet.
-            Err(DeviceError::Timeout { .. } | DeviceError::BadData { .. }) => {}
-            Err(error) => return Err(error),
-        }
-        disarmed.map(|_| ())
     }
 }
