@@ -347,6 +347,21 @@ fn a_camera_that_goes_away_says_so_and_is_opened_again() {
 }
 
 #[test]
+fn a_camera_that_goes_away_while_nobody_uses_it_is_known_to_be_gone() {
+    let rig = Rig::open();
+    assert_eq!(rig.camera.alive(), Ok(()));
+    set_control("disconnect", 1);
+    let start = Instant::now();
+    while rig.camera.alive().is_ok() {
+        assert!(start.elapsed() < WAIT, "it is not noticed");
+        std::thread::sleep(Duration::from_millis(50));
+    }
+    drop(rig);
+    let mut again = Rig::armed(&settings(PixelFormat::Mono8));
+    again.frame().unwrap();
+}
+
+#[test]
 fn the_kernel_takes_a_camera_away_and_gives_it_back() {
     let driver = Path::new("/sys/bus/platform/drivers/vivid");
     let mut rig = Rig::armed(&settings(PixelFormat::Mono8));

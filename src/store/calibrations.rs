@@ -81,11 +81,13 @@ impl Calibrations {
         }
         record.end(CalibrationState::Interrupted, now.to_owned());
         record.blame("interrupted", "the service ended before the calibration did; start it again");
+        // Files have their final name only once they are complete: the measurement was made, only its end was not noted.
         let files = self.files(&record.id);
-        if files.exists()
-            && let Err(error) = fs::remove_dir_all(&files)
-        {
-            tracing::warn!(%error, "what an interrupted calibration left still takes space");
+        if files.exists() {
+            record.blame(
+                "interrupted",
+                format!("the service ended before it noted the end; all files are in {}", files.display()),
+            );
         }
         if let Err(error) = self.write(&record) {
             tracing::warn!(%error, "an interrupted calibration is not noted as such");
@@ -121,7 +123,7 @@ mod tests {
         let [first, second] = &found[..] else { panic!("{found:?}") };
         assert_eq!((first.state, first.finished.as_deref()), (CalibrationState::Interrupted, Some("now")));
         assert_eq!(second, &ended);
-        assert_eq!((store.files("a").exists(), store.files("b").exists()), (false, true));
+        assert_eq!((store.files("a").exists(), store.files("b").exists()), (true, true));
         assert_eq!(store.recover("later").unwrap().iter().find(|one| one.id == "a"), Some(first));
     }
 }

@@ -151,6 +151,9 @@ pub fn robust_sphere(points: &[Point], nominal_mm: f64) -> Result<FittedSphere, 
             scale(&inliers, |point| off_sphere(point, &sphere).map_or(0.0, |off| off.0 / off.1)).max(1.0);
         inliers = on_sphere(points, &sphere, |sigma_mm| GATE * excess * sigma_mm);
     }
+    if inliers.len() < LEAST_POINTS {
+        return Err(FitError::TooFew(inliers.len()));
+    }
     let (centre_mm, radius_mm) = sphere;
     let (_, normal_matrix) = gauss_newton(&inliers, &sphere).ok_or(none)?;
     let inverse = normal_matrix.try_inverse().ok_or(none)?;

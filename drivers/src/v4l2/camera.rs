@@ -127,6 +127,10 @@ impl Camera for V4l2Camera {
         &self.info
     }
 
+    fn alive(&self) -> Result<(), DeviceError> {
+        self.gone.get().map_or(Ok(()), |gone| Err(gone.clone()))
+    }
+
     fn apply(&mut self, settings: &CameraSettings) -> Result<AppliedSettings, DeviceError> {
         let settings = settings.clone();
         self.ask(move |device| device.apply(&settings))

@@ -162,11 +162,19 @@ impl Owner {
         if let Some(record) = self.calibrations.get(id) {
             tracing::info!(id, state = record.state.name(), accepted = record.accepted, "calibration");
         }
-        self.touch_calibration(id);
+        // On the disk, then for all to see, then told: whoever hears of the end fetches the files at once.
+        let revision = self.out.events.next();
+        self.edit_calibration(id, |record| record.revision = revision);
         let written = self.calibrations.get(id).map(|record| self.library.calibrations().write(record));
         if let Some(Err(error)) = written {
-            tracing::error!(id, error = chain(&error), "a calibration is not noted: a restart forgets it");
+            tracing::error!(
+                id,
+                error = chain(&error),
+                "the end of a calibration is not noted: a restart calls it interrupted"
+            );
         }
+        self.publish();
+        self.touch_calibration(id);
     }
 
     /// The rig's thread is alive while whoever measures looks whether to go on.
