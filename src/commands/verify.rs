@@ -7,6 +7,7 @@ use std::{
     time::SystemTime,
 };
 
+use nalgebra::{Matrix3, Vector3};
 use polscan_calibration::artefact::{Accepted, Artefact, Check, Kind, PixelPoint, Point, judge};
 use serde::{Deserialize, Serialize};
 use serde_json::json;
@@ -16,10 +17,11 @@ use crate::{
     cloud::{flag, read_ply},
     config::{ConfigError, Settings},
     engine::Failure,
+    geometry::{Pose, ReadHints},
     store::{
         Policy, StorageError,
         maps::{self, Maps},
-        source::read_bounded,
+        source::{read_bounded, read_calibration},
         time::rfc3339_utc,
     },
 };
@@ -131,14 +133,28 @@ fn read_cloud(bundle: &Path) -> Result<Vec<PixelPoint>, Failure> {
         let detail = format!("has {} points, the maps beside it {}", points.len(), measured.len());
         return Err(bad("cloud.ply", detail));
     }
+    let camera_from_cloud = camera_from_cloud(bundle)?;
     let at = |(index, point): (usize, crate::cloud::PlyPoint)| PixelPoint {
         x: (index % width) as u32,
         y: (index / width) as u32,
-        point: Point { mm: point.point_mm.map(f64::from), sigma_z_mm: f64::from(point.sigma_z_mm) },
+        point: Point {
+            mm: camera_from_cloud.transform(&Vector3::from(point.point_mm.map(f64::from))).into(),
+            sigma_z_mm: f64::from(point.sigma_z_mm),
+        },
     };
     // At a silhouette a pixel sees two surfaces, and its depth is that of neither.
     let one_surface = |(_, point): &(usize, crate::cloud::PlyPoint)| point.flags & flag::SILHOUETTE == 0;
     Ok(measured.into_iter().zip(points).filter(one_surface).map(at).collect())
+}
+
+/// What brings the cloud of a scan back into the camera's frame, in which each point is uncertain along its ray: clouds are in
+/// the world frame of their calibration where that has one.
+fn camera_from_cloud(bundle: &Path) -> Result<Pose, Failure> {
+    let path = bundle.join("calibration.toml");
+    let calibration = read_calibration(&path, &ReadHints::default())
+        .map_err(|error| Failure::data(format!("read {}", path.display()), error))?;
+    let camera = Pose { rotation: Matrix3::identity(), translation_mm: Vector3::zeros() };
+    Ok(calibration.world_from_camera.map_or(camera, |pose| pose.inverse()))
 }
 
 fn read_history(path: &Path) -> Result<Vec<Entry>, Failure> {

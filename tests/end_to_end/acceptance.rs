@@ -114,6 +114,11 @@ impl Bench {
     }
 }
 
+fn checks(answer: &Value) -> impl Iterator<Item = f64> {
+    let checks = answer["result"]["checks"].as_array().expect("checks");
+    checks.iter().map(|check| check["measured_mm"].as_f64().expect("a length"))
+}
+
 fn failed(answer: &Value) -> Vec<&str> {
     let checks = answer["result"]["checks"].as_array().expect("checks");
     let failed = checks.iter().filter(|check| check["passed"] == false);
@@ -138,6 +143,16 @@ fn balls_are_accepted_and_a_projector_that_moved_is_not() {
     assert_eq!(failed(&right), Vec::<&str>::new(), "{right:#}");
     let wrong = bench.verify("wrong", 1);
     assert!(failed(&wrong).contains(&"bar"), "{wrong:#}");
+    // In a world whose z points up, a metre below the camera, the same is measured.
+    let rig = &bench.rig;
+    let world = "\n[world]\nrotation = [[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]]\ntranslation_mm = [0.0, 0.0, 1000.0]\n";
+    let calibration = fs::read_to_string(rig.path("sim-calibration.toml")).expect("the calibration");
+    fs::write(rig.path("world.toml"), calibration + world).expect("a calibration");
+    rig.decode("right", "upright", &["--calibration", text(&rig.path("world.toml"))]).expect(0);
+    let upright = bench.verify("upright", 0);
+    for (check, same) in checks(&upright).zip(checks(&right)) {
+        assert!((check - same).abs() < 1e-3, "{upright:#}");
+    }
 }
 
 #[test]
