@@ -14,7 +14,7 @@ use axum::{
     response::{IntoResponse, Response},
 };
 use serde::Serialize;
-use sha2::Digest as _;
+use sha2::{Digest as _, Sha256};
 use tokio::io::{AsyncReadExt, AsyncSeekExt};
 use tokio_util::io::ReaderStream;
 use utoipa::ToSchema;
@@ -76,7 +76,6 @@ struct Found {
 
 /// Reads the manifest of a bundle; the hash of the file itself comes with it.
 fn manifest(folder: &Path) -> Option<(Manifest, FileEntry)> {
-    use sha2::Sha256;
     let bytes = std::fs::read(folder.join(FILE_NAME)).ok()?;
     let manifest = Manifest::parse(&bytes).ok()?.manifest;
     Some((manifest, FileEntry { bytes: bytes.len() as u64, sha256: hex(&Sha256::digest(&bytes)) }))
@@ -192,16 +191,25 @@ fn has_tag(header: Option<&str>, tag: &str) -> bool {
     })
 }
 
+fn value(text: &str) -> HeaderValue {
+    HeaderValue::from_str(text).unwrap_or(HeaderValue::from_static(""))
+}
+
+/// The tag of a file with this hash, and the headers that say what it is.
+fn described(name: &str, sha256: &str) -> (String, HeaderMap) {
+    let tag = format!("\"{sha256}\"");
+    let mut headers = HeaderMap::new();
+    headers.insert(header::ETAG, value(&tag));
+    headers.insert(header::CONTENT_TYPE, HeaderValue::from_static(media_type(name)));
+    // Results never change; whoever has a file has it for ever, but must ask whether it is still there.
+    headers.insert(header::CACHE_CONTROL, HeaderValue::from_static("private, no-cache"));
+    (tag, headers)
+}
+
 async fn serve(app: &App, id: &str, name: &str, headers: &HeaderMap) -> Result<Response, Problem> {
     let Found { path, entry } = locate(app, id, name).await?;
-    let tag = format!("\"{}\"", entry.sha256);
-    let value = |text: &str| HeaderValue::from_str(text).unwrap_or(HeaderValue::from_static(""));
-    let mut answer = HeaderMap::new();
-    answer.insert(header::ETAG, value(&tag));
+    let (tag, mut answer) = described(name, &entry.sha256);
     answer.insert(header::ACCEPT_RANGES, HeaderValue::from_static("bytes"));
-    answer.insert(header::CONTENT_TYPE, HeaderValue::from_static(media_type(name)));
-    // Bundles never change; whoever has a file has it for ever, but must ask whether the scan is still there.
-    answer.insert(header::CACHE_CONTROL, HeaderValue::from_static("private, no-cache"));
     if has_tag(header_text(headers, header::IF_NONE_MATCH), &tag) {
         return Ok((StatusCode::NOT_MODIFIED, answer).into_response());
     }
@@ -234,11 +242,7 @@ async fn serve(app: &App, id: &str, name: &str, headers: &HeaderMap) -> Result<R
 /// A small file as a whole; one that went away meanwhile is none.
 pub async fn serve_file(path: &Path, name: &str, headers: &HeaderMap) -> Response {
     let Ok(bytes) = tokio::fs::read(path).await else { return no_artifact(name).into_response() };
-    let tag = format!("\"{}\"", hex(&sha2::Sha256::digest(&bytes)));
-    let mut answer = HeaderMap::new();
-    answer.insert(header::ETAG, HeaderValue::from_str(&tag).unwrap_or(HeaderValue::from_static("")));
-    answer.insert(header::CONTENT_TYPE, HeaderValue::from_static(media_type(name)));
-    answer.insert(header::CACHE_CONTROL, HeaderValue::from_static("private, no-cache"));
+    let (tag, answer) = described(name, &hex(&Sha256::digest(&bytes)));
     if has_tag(header_text(headers, header::IF_NONE_MATCH), &tag) {
         return (StatusCode::NOT_MODIFIED, answer).into_response();
     }

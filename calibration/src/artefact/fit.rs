@@ -140,24 +140,18 @@ pub fn robust_sphere(points: &[Point], nominal_mm: f64) -> Result<FittedSphere, 
     let distance = |&(centre, radius): &Sphere, point: &Vector3<f64>| (point - centre).norm() - radius;
     let mut sphere =
         consensus(points, (4, BALL_QUANTILE), through, distance)?.map(|(sphere, _)| sphere).ok_or(none)?;
-    let mut inliers = on_sphere(points, &sphere, |sigma_mm| GATE * sigma_mm + FIRST_GATE * nominal_mm);
+    let in_sigma =
+        |sphere: &Sphere, point: &Point| off_sphere(point, sphere).map_or(0.0, |(off, sigma)| off / sigma);
+    let mut inliers = on_sphere(points, &sphere, |sigma_mm| GATE * sigma_mm + FIRST_GATE * nominal_mm)?;
     for _ in 0..12 {
-        if inliers.len() < LEAST_POINTS {
-            return Err(FitError::TooFew(inliers.len()));
-        }
-        let (step, _) = gauss_newton(&inliers, &sphere).ok_or(none)?;
-        sphere = step;
-        let excess =
-            scale(&inliers, |point| off_sphere(point, &sphere).map_or(0.0, |off| off.0 / off.1)).max(1.0);
-        inliers = on_sphere(points, &sphere, |sigma_mm| GATE * excess * sigma_mm);
-    }
-    if inliers.len() < LEAST_POINTS {
-        return Err(FitError::TooFew(inliers.len()));
+        (sphere, _) = gauss_newton(&inliers, &sphere).ok_or(none)?;
+        let excess = scale(&inliers, |point| in_sigma(&sphere, point)).max(1.0);
+        inliers = on_sphere(points, &sphere, |sigma_mm| GATE * excess * sigma_mm)?;
     }
     let (centre_mm, radius_mm) = sphere;
     let (_, normal_matrix) = gauss_newton(&inliers, &sphere).ok_or(none)?;
     let inverse = normal_matrix.try_inverse().ok_or(none)?;
-    let excess = rms(&inliers, |point| off_sphere(point, &sphere).map_or(0.0, |off| off.0 / off.1)).max(1.0);
+    let excess = rms(&inliers, |point| in_sigma(&sphere, point)).max(1.0);
     let rms_mm = rms(&inliers, |point| distance(&sphere, &vector(point)));
     let share = inliers.len() as f64 / points.len() as f64;
     Ok(FittedSphere {
@@ -178,10 +172,11 @@ fn off_sphere(point: &Point, (centre, radius): &Sphere) -> Option<(f64, f64)> {
 }
 
 /// The points that are no further from a sphere than `gate` makes of the standard deviation of their distance.
-fn on_sphere(points: &[Point], sphere: &Sphere, gate: impl Fn(f64) -> f64) -> Vec<Point> {
+fn on_sphere(points: &[Point], sphere: &Sphere, gate: impl Fn(f64) -> f64) -> Result<Vec<Point>, FitError> {
     let near =
         |point: &&Point| off_sphere(point, sphere).is_some_and(|(off, sigma)| off.abs() <= gate(sigma));
-    points.iter().filter(near).copied().collect()
+    let found: Vec<Point> = points.iter().filter(near).copied().collect();
+    if found.len() < LEAST_POINTS { Err(FitError::TooFew(found.len())) } else { Ok(found) }
 }
 
 /// Centre and radius in mm.

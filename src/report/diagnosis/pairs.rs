@@ -180,19 +180,14 @@ pub fn diagnose(decoded: &Decoded, frames: Option<Frames>) -> Vec<Reason> {
         let look = frames.and_then(|frames| frames.look(view.pair.axis, view.pair.bit, false));
         Case { view, look }
     });
-    // A lamp that dips in between fine pairs: unlike any response, it changes the frames of a pair unequally.
-    let lit_otherwise: Vec<Case> = if lone_fine.is_none() {
-        frames.map_or(Vec::new(), |frames| flickering(&fine, frames))
-    } else {
-        Vec::new()
-    };
     let light = |case: &Case| {
         case.look.as_ref().is_some_and(|look| matches!(look.cause(), Cause::Lamp | Cause::Room))
     };
     if lone_fine.as_ref().is_some_and(light) {
         shifted.extend(lone_fine.take());
     }
-    shifted.extend(lit_otherwise);
+    // A lamp that dips in between fine pairs: unlike any response, it changes the frames of a pair unequally.
+    shifted.extend(frames.map(|frames| flickering(&fine, frames)).unwrap_or_default());
 
     let mut reasons = Vec::new();
     reasons.extend(light::brightness(decoded, frames, &coarse, &shifted));
@@ -270,12 +265,8 @@ fn lone<'a>(fine: &[View<'a>]) -> Option<View<'a>> {
 
 /// Two fine pairs, the others being sound, between which the light was another for a frame or two.
 fn flickering<'a>(fine: &[View<'a>], frames: Frames) -> Vec<Case<'a>> {
-    let bad: Vec<View> = fine.iter().filter(|view| view.outliers() > LONE_OUTLIERS).copied().collect();
-    let others = fine.iter().filter(|view| view.outliers() <= LONE_OUTLIERS);
-    if bad.len() != 2
-        || others.clone().count() == 0
-        || others.into_iter().any(|view| view.outliers() > SOUND_OUTLIERS)
-    {
+    let (bad, others): (Vec<View>, Vec<View>) = fine.iter().partition(|view| view.outliers() > LONE_OUTLIERS);
+    if bad.len() != 2 || others.is_empty() || others.iter().any(|view| view.outliers() > SOUND_OUTLIERS) {
         return Vec::new();
     }
     let cases: Vec<Case> = bad

@@ -163,9 +163,8 @@ impl Owner {
             tracing::info!(id, state = record.state.name(), accepted = record.accepted, "calibration");
         }
         // On the disk, then for all to see, then told: whoever hears of the end fetches the files at once.
-        let revision = self.out.events.next();
-        self.edit_calibration(id, |record| record.revision = revision);
-        let written = self.calibrations.get(id).map(|record| self.library.calibrations().write(record));
+        let revised = self.revise_calibration(id);
+        let written = revised.map(|record| self.library.calibrations().write(&record));
         if let Some(Err(error)) = written {
             tracing::error!(
                 id,
@@ -174,7 +173,7 @@ impl Owner {
             );
         }
         self.publish();
-        self.touch_calibration(id);
+        self.tell_calibration(id);
     }
 
     /// The rig's thread is alive while whoever measures looks whether to go on.
@@ -193,20 +192,28 @@ impl Owner {
         }
     }
 
-    /// Gives a calibration a new revision and tells.
-    fn touch_calibration(&mut self, id: &str) {
+    /// Gives a calibration the number of the event that will tell of it.
+    fn revise_calibration(&mut self, id: &str) -> Option<Arc<CalibrationRecord>> {
         let revision = self.out.events.next();
         self.edit_calibration(id, |record| record.revision = revision);
+        self.calibrations.get(id).cloned()
+    }
+
+    /// Gives a calibration a new revision and tells.
+    fn touch_calibration(&mut self, id: &str) {
+        self.revise_calibration(id);
+        self.tell_calibration(id);
+    }
+
+    fn tell_calibration(&mut self, id: &str) {
         let Some(record) = self.calibrations.get(id) else { return };
         let data = serde_json::to_string(&**record).unwrap_or_default();
         self.event("calibration", |_| data);
     }
 
     fn calibration_value(&mut self, id: &str) {
-        let revision = self.out.events.next();
-        self.edit_calibration(id, |record| record.revision = revision);
-        let Some(record) = self.calibrations.get(id) else { return };
-        let data = serde_json::json!({ "id": id, "revision": revision, "live": record.live });
+        let Some(record) = self.revise_calibration(id) else { return };
+        let data = serde_json::json!({ "id": id, "revision": record.revision, "live": record.live });
         self.event("calibration-value", |_| data.to_string());
     }
 }
