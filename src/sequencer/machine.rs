@@ -329,7 +329,7 @@ impl Machine {
             }
             // Light that stays changed: another try would show the same, and the decode stands.
             PairVerdict::Retake(suspicion)
-                if is_of_the_light(&suspicion) && !self.may_help(group, &suspicion) =>
+                if is_of_the_light(&suspicion.reason) && !self.may_help(group, &suspicion) =>
             {
                 self.findings.push(finding(suspicion));
                 vec![Action::Accept { group }]
@@ -346,13 +346,15 @@ impl Machine {
             }
             PairVerdict::Retake(suspicion) => {
                 let evidence = self.with_tries(group, suspicion.evidence);
-                let reason = suspicion.reason;
-                return self.finish(Outcome::Failed(Diagnosis {
-                    reason,
-                    role: Some(role),
-                    evidence,
-                    source: None,
-                }));
+                let Some(light) = self.changed_light(subject) else {
+                    let reason = suspicion.reason;
+                    let diagnosis = Diagnosis { reason, role: Some(role), evidence, source: None };
+                    return self.finish(Outcome::Failed(diagnosis));
+                };
+                // In light that changes from take to take one pair cannot tell; all of them together can.
+                let evidence = format!("{evidence}; the light changed between the takes");
+                self.findings.push(finding(Suspicion { reason: light, evidence, ..suspicion }));
+                vec![Action::Accept { group }]
             }
         };
         match phase {
@@ -446,6 +448,13 @@ impl Machine {
         self.may_repeat(group) && !self.lasting.contains(&suspicion.reason)
     }
 
+    /// Slug of the change of the light that a pair was taken again for, or any other pair in vain.
+    fn changed_light(&self, subject: Subject) -> Option<String> {
+        let Subject::Pair { group } = subject else { return None };
+        let own = self.retaken.iter().filter(|take| take.group == group).map(|take| &take.reason);
+        own.chain(&self.lasting).find(|reason| is_of_the_light(reason)).cloned()
+    }
+
     fn may_repeat(&self, group: usize) -> bool {
         self.attempts[group] < self.retakes_each && self.retaken.len() < self.retakes_total as usize
     }
@@ -477,9 +486,9 @@ impl Machine {
     }
 }
 
-/// Whether the frames show what was asked for in another light.
-fn is_of_the_light(suspicion: &Suspicion) -> bool {
-    matches!(suspicion.reason.as_str(), "flicker" | "ambient-drift" | "exposure-drift")
+/// Whether frames of this reason show what was asked for in another light.
+fn is_of_the_light(reason: &str) -> bool {
+    matches!(reason, "flicker" | "ambient-drift" | "exposure-drift")
 }
 
 /// Whether a frame is not the one that was asked for: as a reference it would spoil the mean of the good ones.

@@ -36,6 +36,8 @@ pub(super) struct History {
     last_pair: Option<[Frame; 3]>,
     /// The rest that pairs had.
     rest: Option<f64>,
+    /// Whether the camera was seen to adjust itself: it goes on to, also where its steps have become small.
+    automatic: bool,
 }
 
 impl History {
@@ -54,9 +56,9 @@ impl History {
         camera: &CameraResponse,
         noise: Option<NoiseModel>,
     ) -> Option<Lasting> {
-        let automatic = self.is_automatic(frames, camera);
+        self.automatic |= self.adjusts(frames, camera);
         self.settle(frames, camera, noise);
-        if automatic { Some(Lasting::Automatic) } else { self.rest.map(Lasting::Rest) }
+        if self.automatic { Some(Lasting::Automatic) } else { self.rest.map(Lasting::Rest) }
     }
 
     /// Whether the display was found not to settle.
@@ -64,7 +66,7 @@ impl History {
         self.rest.is_some()
     }
 
-    fn is_automatic(&mut self, frames: [&Frame; 2], camera: &CameraResponse) -> bool {
+    fn adjusts(&mut self, frames: [&Frame; 2], camera: &CameraResponse) -> bool {
         let Some(gauge) = &self.gauge else { return false };
         let gauge = Gauge {
             reference: plane(gauge.pixels()),

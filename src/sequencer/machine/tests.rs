@@ -352,6 +352,20 @@ fn light_that_stays_changed_is_noted_after_one_try_and_the_scan_goes_on() {
 }
 
 #[test]
+fn a_pair_that_cannot_be_told_in_changing_light_is_left_to_the_whole_scan() {
+    let mut story = Story::begin(Mode::Pse);
+    for reason in ["torn-frame", "ambient-drift", "torn-frame"] {
+        story.until(|action| *action == Action::Judge(Subject::Pair { group: 2 }));
+        story.tell(Event::Judged(Subject::Pair { group: 2 }, suspicious(reason)));
+    }
+    assert_eq!(story.outcome(), Outcome::Complete);
+    assert_eq!(story.retakes(), [(2, "torn-frame", 1), (2, "ambient-drift", 2)]);
+    let [finding] = story.machine.findings() else { panic!("{:?}", story.machine.findings()) };
+    assert_eq!(finding.reason, "ambient-drift");
+    assert!(finding.evidence.contains("the light changed between the takes"), "{}", finding.evidence);
+}
+
+#[test]
 fn a_dip_of_the_lamp_costs_one_try() {
     let mut story = Story::begin(Mode::Pse);
     story.until(|action| *action == Action::Judge(Subject::Pair { group: 2 }));
