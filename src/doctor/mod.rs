@@ -12,7 +12,7 @@ use serde::Serialize;
 use crate::{
     app::{self, Beam, RigError},
     config::{DeviceDriver, Settings},
-    store::Library,
+    store::{Library, StorageError, library::chain},
 };
 
 pub use machine::Machine;
@@ -124,12 +124,24 @@ fn devices(kind: &'static str, driver: DeviceDriver, serial: &str, found: &[List
 }
 
 /// What only the open window knows. While the service uses the display it is left alone, since a second window would cover the first.
-fn display(in_use: bool, open: impl FnOnce() -> Result<Vec<String>, RigError>) -> Vec<Finding> {
+fn display(
+    in_use: Result<bool, StorageError>,
+    open: impl FnOnce() -> Result<Vec<String>, RigError>,
+) -> Vec<Finding> {
     let one = |level, message: String| vec![Finding::new("display", level, message)];
-    if in_use {
-        let message =
-            "the service has it; what it found is in /v1/status, under projector.display".to_owned();
-        return one(Level::Ok, message);
+    match in_use {
+        Ok(false) => {}
+        Ok(true) => {
+            let message = "the service has it; what it found is in /v1/status, under projector.display";
+            return one(Level::Ok, message.to_owned());
+        }
+        Err(error) => {
+            let message = format!(
+                "not looked at, since it is not known whether the service has it: {}; run this as the service's user",
+                chain(&error)
+            );
+            return one(Level::Warning, message);
+        }
     }
     match open() {
         Ok(found) if found.is_empty() => {
@@ -185,12 +197,17 @@ mod tests {
 
     #[test]
     fn a_display_that_the_service_uses_is_left_alone() {
-        let found = display(true, || panic!("it is left alone"));
+        let found = display(Ok(true), || panic!("it is left alone"));
         assert_eq!(found[0].level, Level::Ok);
-        assert_eq!(display(false, || Ok(Vec::new()))[0].level, Level::Ok);
-        let doubts = display(false, || Ok(vec!["a compositor".into(), "a gamma table".into()]));
+        assert_eq!(display(Ok(false), || Ok(Vec::new()))[0].level, Level::Ok);
+        let doubts = display(Ok(false), || Ok(vec!["a compositor".into(), "a gamma table".into()]));
         assert_eq!(doubts.iter().map(|found| found.level).collect::<Vec<_>>(), [Level::Warning; 2]);
         let lost = DeviceError::Unavailable { device: "screen".into(), detail: "is not there".into() };
-        assert_eq!(display(false, || Err(lost.into()))[0].level, Level::Bad);
+        assert_eq!(display(Ok(false), || Err(lost.into()))[0].level, Level::Bad);
+        let hidden =
+            StorageError::file("open", Path::new("lock"), std::io::ErrorKind::PermissionDenied.into());
+        let unknown = display(Err(hidden), || panic!("it is left alone"));
+        assert_eq!(unknown[0].level, Level::Warning);
+        assert!(unknown[0].message.contains("service's user"), "{unknown:?}");
     }
 }

@@ -6,7 +6,7 @@ use polscan_calibration::synchrony::{
     BandTiming, Reading, Ripple, Sample, SyncError, Timing as Measured, combine, edge, plateau, ripple,
 };
 use polscan_drivers::{
-    camera::CameraSettings,
+    camera::{CameraInfo, CameraSettings},
     clock::Timestamp,
     projector::{ProjectorInfo, ProjectorTiming, Slide},
 };
@@ -98,6 +98,7 @@ pub fn measure(
     progress: &mut dyn FnMut(&str),
 ) -> Result<Synchrony, Failure> {
     let mut bench = Bench::new(rig, OPERATION, cancel);
+    refuse_free_running(bench.camera())?;
     let projector = bench.projector().clone();
     bench.load(&slides(&projector))?;
     progress("finding the picture");
@@ -136,6 +137,19 @@ pub fn measure(
         .ok_or_else(|| Failure::data(OPERATION, "no part of the picture is seen".to_owned()))?;
     let chosen = choose(&projector, &timing, applied.settings.exposure_us, applied.readout_us)?;
     Ok(Synchrony { projector, timing, bands: timings, unseen, curves, ripple, exposure_ms, chosen })
+}
+
+/// A camera that exposes when it likes says when by its frames' arrival, less well than the display is to be known.
+fn refuse_free_running(camera: &CameraInfo) -> Result<(), Failure> {
+    if camera.triggered {
+        return Ok(());
+    }
+    let message = format!(
+        "camera {} of driver {} has no trigger, so that the start of an exposure is not known to the millisecond; measure \
+         this projector with a camera that has one and name the file in rig.sync",
+        camera.serial, camera.driver
+    );
+    Err(Failure::NoDevice { operation: OPERATION, message })
 }
 
 /// Black, the channels, and white in each band alone.
@@ -281,4 +295,24 @@ fn choose(
 fn projector_timing(timing: &Measured) -> ProjectorTiming {
     let duration = |ms: f64| Duration::from_secs_f64(1e-3 * ms.max(0.0));
     ProjectorTiming { latency: duration(timing.latency_ms), settling: duration(timing.settling_ms) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_camera_without_a_trigger_is_refused_by_name() {
+        let camera = |triggered| CameraInfo {
+            driver: "v4l2".into(),
+            model: "Webcam".into(),
+            serial: "usb-1".into(),
+            sensor_width: 640,
+            sensor_height: 480,
+            triggered,
+        };
+        assert!(refuse_free_running(&camera(true)).is_ok());
+        let refused = refuse_free_running(&camera(false)).unwrap_err().to_string();
+        assert!(refused.contains("usb-1") && refused.contains("rig.sync"), "{refused}");
+    }
 }

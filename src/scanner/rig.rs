@@ -197,6 +197,7 @@ pub fn run(shared: &Shared, commands: &Receiver<Command>) {
     let mut open: Option<Open> = None;
     let mut failures = 0usize;
     let mut next_try = Instant::now();
+    let mut looked = Instant::now();
     loop {
         shared.heartbeat.beat();
         if open.is_none() && Instant::now() >= next_try {
@@ -221,9 +222,7 @@ pub fn run(shared: &Shared, commands: &Receiver<Command>) {
         let down = |message: &String| shared.down(message);
         let broken = match (commands.recv_timeout(wait), &mut open) {
             (Err(RecvTimeoutError::Disconnected), _) => break,
-            (Err(RecvTimeoutError::Timeout), open) => {
-                open.as_mut().and_then(|rig| rig.alive().err()).map(|error| error.to_string()).inspect(down)
-            }
+            (Err(RecvTimeoutError::Timeout), _) => None,
             (Ok(Command::Scan(job)), Some(rig)) => rig.scan(shared, *job),
             (Ok(Command::Calibrate(job)), Some(rig)) => rig.calibrate(shared, &job),
             (Ok(Command::Show(shown, name, reply)), Some(rig)) => {
@@ -241,6 +240,14 @@ pub fn run(shared: &Shared, commands: &Receiver<Command>) {
                 refuse(shared, command);
                 None
             }
+        };
+        // Whoever watches the preview asks again and again: the projector is looked after all the same.
+        let broken = match &mut open {
+            Some(rig) if broken.is_none() && looked.elapsed() >= TICK => {
+                looked = Instant::now();
+                rig.alive().err().map(|error| error.to_string()).inspect(down)
+            }
+            _ => broken,
         };
         if let Some(message) = broken {
             tracing::warn!(message, "the rig is opened again");

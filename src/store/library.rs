@@ -76,10 +76,17 @@ impl Library {
         Ok(Self { folder, _lock: lock })
     }
 
-    /// Whether a service has the store in `folder`; one that cannot be looked at counts as free.
-    pub fn is_in_use(folder: &Path) -> bool {
-        let lock = File::open(folder.join(LOCK));
-        lock.is_ok_and(|lock| matches!(lock.try_lock_shared(), Err(TryLockError::WouldBlock)))
+    /// Whether a service has the store in `folder`.
+    ///
+    /// # Errors
+    /// A store that this user may not look into.
+    pub fn is_in_use(folder: &Path) -> Result<bool, StorageError> {
+        let path = folder.join(LOCK);
+        match File::open(&path) {
+            Ok(lock) => Ok(matches!(lock.try_lock_shared(), Err(TryLockError::WouldBlock))),
+            Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(false),
+            Err(error) => Err(StorageError::file("open", &path, error)),
+        }
     }
 
     /// Where the store is.

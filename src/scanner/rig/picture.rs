@@ -10,7 +10,7 @@ use crate::{
     engine::{Failure, Shown, hold},
 };
 
-/// How long a frame for the preview is waited for, beyond its exposure.
+/// How long a frame for the preview is waited for, beyond its exposure and what the camera needs to deliver it.
 const PREVIEW_SLACK: Duration = Duration::from_millis(500);
 
 impl Open {
@@ -24,11 +24,12 @@ impl Open {
     pub(super) fn preview(&mut self, shared: &Shared) -> Result<(), DeviceError> {
         let Rig { camera, clock, .. } = &mut self.rig;
         camera.arm(1)?;
-        let exposure = Duration::from_secs_f64(1e-6 * self.prepared.applied.settings.exposure_us);
-        let taken = camera.trigger(clock.now()).and_then(|_| camera.next_frame(exposure + PREVIEW_SLACK));
+        let applied = &self.prepared.applied;
+        let frame = Duration::from_secs_f64(1e-6 * (applied.settings.exposure_us + applied.readout_us));
+        let taken = camera.trigger(clock.now()).and_then(|_| camera.next_frame(frame + PREVIEW_SLACK));
         let disarmed = camera.disarm();
         match taken {
-            Ok(frame) => shared.preview.offer(&frame, &self.prepared.applied),
+            Ok(frame) => shared.preview.offer(&frame, applied),
             // One frame more or less does not matter here, nor one that lost a packet.
             Err(DeviceError::Timeout { .. } | DeviceError::BadData { .. }) => {}
             Err(error) => return Err(error),
