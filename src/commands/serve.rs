@@ -22,9 +22,6 @@ use crate::{
     store::{Library, library::Recovery, time::rfc3339_utc},
 };
 
-/// How long the scan that is running may take to end after the service was asked to.
-const GRACE: Duration = Duration::from_secs(30);
-
 /// How often systemd is asked for patience meanwhile, and for how much.
 const PATIENCE: Duration = Duration::from_secs(5);
 
@@ -61,6 +58,7 @@ pub fn serve(settings: Settings, address_file: Option<&Path>, json: bool) -> Res
     }
     let (scanner, threads) = scanner::start(settings.clone(), library, index)
         .map_err(|error| setup("start the threads of the scanner", error))?;
+    let grace = Duration::from_secs_f64(settings.raw.api.stop_grace_s);
     let (stop, stopping) = watch::channel(false);
     let app = App::new(scanner.clone(), settings, tokens.clone(), listening.ip(), stopping.clone());
     runtime.block_on(async {
@@ -75,7 +73,7 @@ pub fn serve(settings: Settings, address_file: Option<&Path>, json: bool) -> Res
         let supervised = tokio::spawn(supervise(scanner.clone(), notify.clone()));
         let status = tokio::spawn(tell_status(scanner.clone(), notify.clone()));
         asked_to_end().await;
-        end(&scanner, threads, &notify).await;
+        end(&scanner, threads, grace, &notify).await;
         // Now whoever waited has its answer, and streams may break off.
         stop.send_replace(true);
         let _ = served.await;
@@ -171,9 +169,9 @@ async fn asked_to_end() {
 }
 
 /// Ends the scanner. The running scan comes to its end, or is cut short after a while; queued ones stay queued.
-async fn end(scanner: &Scanner, threads: Threads, notify: &Notify) {
+async fn end(scanner: &Scanner, threads: Threads, grace: Duration, notify: &Notify) {
     // First: whoever hears that the service is ending must not get a scan from it any more.
-    scanner.stop(GRACE);
+    scanner.stop(grace);
     notify.send("STOPPING=1");
     let mut joined = tokio::task::spawn_blocking(move || threads.join());
     while tokio::time::timeout(PATIENCE, &mut joined).await.is_err() {

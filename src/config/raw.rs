@@ -54,6 +54,8 @@ pub struct Api {
     pub streams: usize,
     /// Longest wait for a scan in seconds.
     pub wait_limit_s: f64,
+    /// Seconds that the running scan has to come to its end when the service is stopped.
+    pub stop_grace_s: f64,
     /// How long idempotency keys are kept, in hours.
     pub idempotency_hours: f64,
 }

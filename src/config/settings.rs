@@ -146,6 +146,7 @@ fn check_ranges(raw: &Raw, faults: &mut Faults) {
     within("api.concurrency", raw.api.concurrency as f64, 1.0, 10_000.0, "");
     within("api.streams", raw.api.streams as f64, 1.0, 10_000.0, "");
     within("api.wait_limit_s", raw.api.wait_limit_s, 1.0, 86_400.0, " s");
+    within("api.stop_grace_s", raw.api.stop_grace_s, 0.0, 3600.0, " s");
     within("api.idempotency_hours", raw.api.idempotency_hours, 0.01, 10_000.0, " h");
     within("store.quota_gib", raw.store.quota_gib, 0.0, 1e6, " GiB");
     within("store.min_free_gib", raw.store.min_free_gib, 0.0, 1e6, " GiB");

@@ -46,6 +46,24 @@ fn the_service_manager_is_told_and_the_running_scan_comes_to_its_end() {
 }
 
 #[test]
+fn a_scan_that_takes_longer_than_the_service_may_is_cut_short() {
+    // Half a second for each of some forty patterns.
+    let rig = Rig::small().set("sim.pacing", "real-time").set("projector.hold_refreshes", 30);
+    let mut daemon = Daemon::on(rig.set("api.stop_grace_s", 0.5)).started();
+    let id = daemon.scan(&json!({ "mode": "pse" }));
+    daemon.until(&id, |scan| scan["progress"]["frames"].as_u64() >= Some(2));
+    let asked = std::time::Instant::now();
+    let status = daemon.stop();
+    assert!(status.success(), "{status}");
+    assert!(asked.elapsed() < Duration::from_secs(10), "{:?}", asked.elapsed());
+    daemon.start();
+    let scan = daemon.state(&id);
+    assert_eq!(scan["state"], "interrupted", "{scan}");
+    let frames = daemon.get(&format!("/v1/scans/{id}/frames.npy")).expect(200);
+    assert!(frames.body.starts_with(b"\x93NUMPY"));
+}
+
+#[test]
 fn what_keeps_a_service_from_starting_is_said() {
     let daemon = Daemon::fast();
     let config = daemon.rig.config();
