@@ -21,9 +21,10 @@ faults: ## let everything go wrong on the simulated rig, and see what it is call
 	@scripts/install build
 	@scripts/faults
 
-soak: ## 500 scans in a row with polling and following clients, and lists of 10 000 scans
-	@scripts/install build
+soak: ## 500 scans in a row with clients, lists of 10 000 scans, and a camera torn away every 10 s for 10 minutes
+	@scripts/install test
 	@scripts/soak five_hundred_scans ten_thousand_scans
+	@scripts/closed-loop torn_away_for_ten_minutes
 
 kills: ## 50 deaths of the service at random moments under load
 	@scripts/install build
@@ -39,7 +40,7 @@ foreign-plane: ## check the decoder from outside, with an independent numpy mode
 
 closed-loop: ## scan at full size through the real window and a camera in software, about 2 minutes
 	@scripts/install test
-	@scripts/closed-loop
+	@scripts/closed-loop size_of_the_papers_rig
 
 fuzz: ## every parser with damaged input, 15 minutes each; scripts/fuzz SECONDS for less
 	@scripts/install build

@@ -21,7 +21,7 @@ const DEADLINE: Duration = Duration::from_secs(15);
 const IN_THE_MIDDLE: u64 = 6;
 
 /// The stage of a small twin, and the service on it.
-fn set_up() -> (Stage, Daemon) {
+pub fn set_up() -> (Stage, Daemon) {
     let stage = Stage::new(Rig::small(), 20.0);
     let daemon = stage.daemon(Rig::small());
     daemon.ready();
@@ -29,7 +29,7 @@ fn set_up() -> (Stage, Daemon) {
 }
 
 /// Begins a scan and waits until it is in the middle.
-fn in_the_middle(daemon: &Daemon) -> String {
+pub fn in_the_middle(daemon: &Daemon) -> String {
     let id = daemon.scan(&json!({ "mode": "fast" }));
     daemon.until(&id, |scan| {
         let stream = || daemon.get("/v1/status").json()["camera_stream"].clone();
@@ -41,7 +41,7 @@ fn in_the_middle(daemon: &Daemon) -> String {
 
 /// The scan that failed since `since`, whose error says all of `says`, as does the status.
 #[track_caller]
-fn failed(daemon: &Daemon, id: &str, since: Instant, kind: &str, says: &[&str]) {
+pub fn failed(daemon: &Daemon, id: &str, since: Instant, kind: &str, says: &[&str]) {
     let scan = daemon.until(id, |scan| scan["state"] == "failed");
     let after = since.elapsed();
     assert!(after < DEADLINE, "{after:?}");
@@ -86,7 +86,7 @@ fn tells_fault(events: &mut Events, says: &str) {
 
 /// The next scan, once the rig is open again.
 #[track_caller]
-fn works_again(daemon: &Daemon) {
+pub fn works_again(daemon: &Daemon) {
     daemon.ready();
     let scan = daemon.post("/v1/scans?wait=done", &json!({ "mode": "fast" })).expect(202).json();
     assert_eq!(scan["state"], "done", "{scan}");

@@ -15,6 +15,7 @@ mod measure;
 mod rig;
 mod scans;
 mod set_up;
+mod soak;
 mod stage;
 #[path = "../window/xvfb.rs"]
 #[allow(dead_code, reason = "the window's own suite needs more of it")]

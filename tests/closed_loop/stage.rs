@@ -160,7 +160,13 @@ impl Stage {
         self.running.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    fn plug(&mut self) {
+    /// Takes the camera away with its sockets: whoever writes to it hears that nobody is there.
+    pub fn unplug(&mut self) {
+        self.camera = None;
+    }
+
+    /// Puts the camera where it was.
+    pub fn plug(&mut self) {
         let (description, _) = self.settings.sim.as_ref().expect("a twin");
         let [width, height] = description.projector.size;
         let mut optics = Optics::new(&self.rig, self.clock.clone(), &self.settings.camera);
