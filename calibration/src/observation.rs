@@ -1,7 +1,9 @@
 //! What one picture of a calibration board says: the seam between finding boards and solving for optics.
 
+use serde::{Deserialize, Serialize};
+
 /// A marked point of the board, found in the image.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Corner {
     /// Number of the point on the board; the same in every view.
     pub id: u32,
@@ -12,7 +14,7 @@ pub struct Corner {
 }
 
 /// A camera pixel on the plane of the board, decoded: where on the board it lies is not known.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct PlanePoint {
     /// Camera pixel, in px.
     pub camera_px: [f64; 2],
@@ -21,7 +23,7 @@ pub struct PlanePoint {
 }
 
 /// One view of the board.
-#[derive(Debug, Clone, Default, PartialEq)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct View {
     /// What the user calls it; messages name it.
     pub name: String,

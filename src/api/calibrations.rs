@@ -23,7 +23,7 @@ use crate::{
     calibrate::{Task, polarization},
     geometry::{Calibration, ReadHints},
     report::NamedRegion,
-    scanner::{CalibrationAsk, CalibrationRecord, is_id},
+    scanner::{CalibrationAsk, CalibrationRecord, CalibrationState, is_id},
     store::{calibrations::Calibrations as Store, source::read_calibration},
 };
 
@@ -66,14 +66,14 @@ pub struct CalibrationRun {
 }
 
 impl CalibrationRun {
-    fn new(record: &CalibrationRecord) -> Self {
+    pub(super) fn new(record: &CalibrationRecord) -> Self {
         let href = format!("/v1/calibrations/{}", record.id);
         let file = |name: &String| CalibrationFile { name: name.clone(), href: format!("{href}/{name}") };
         let artifacts = record.files.iter().map(file).collect();
         Self { record: record.clone(), artifacts, href }
     }
 
-    fn accepted(&self) -> Response {
+    pub(super) fn accepted(&self) -> Response {
         let mut response = (StatusCode::ACCEPTED, Json(self)).into_response();
         if let Ok(location) = HeaderValue::from_str(&self.href) {
             response.headers_mut().insert(header::LOCATION, location);
@@ -243,18 +243,7 @@ pub async fn post_polarization(
     begin(&app, Task::Polarization(task), asked.with).await
 }
 
-/// Calibrate the rig
-///
-/// Not part of the service yet: use `polscan calibrate rig` on the command line.
-#[utoipa::path(post, path = "/v1/calibrations/rig", tag = "calibrations",
-    responses((status = 501, description = "Not part of the service", body = ProblemBody, content_type = "application/problem+json")))]
-pub async fn post_rig(MaybeBody(Empty {}): MaybeBody<Empty>) -> Problem {
-    Kind::Unsupported.with(
-        "the service does not calibrate rigs yet: stop it, use `polscan calibrate rig`, and name the file in rig.calibration",
-    )
-}
-
-fn unknown() -> Problem {
+pub(super) fn unknown() -> Problem {
     Kind::UnknownCalibration.with("no calibration has this identity; GET /v1/calibrations lists them")
 }
 
@@ -262,7 +251,7 @@ fn find(app: &App, id: &str) -> Result<Arc<CalibrationRecord>, Problem> {
     app.scanner.snapshot().calibrations.get(id).cloned().ok_or_else(unknown)
 }
 
-type OnePart = Result<Part<String>, PathRejection>;
+pub(super) type OnePart = Result<Part<String>, PathRejection>;
 
 /// One calibration
 #[utoipa::path(get, path = "/v1/calibrations/{id}", tag = "calibrations", params(("id" = String, Path)),
@@ -284,7 +273,7 @@ pub async fn post_unknown(MaybeBody(Empty {}): MaybeBody<Empty>) -> Problem {
 
 /// Stop a calibration
 ///
-/// It ends as `cancelled` and leaves the rig to others; a watch ends as `done`.
+/// It ends as `cancelled` and leaves the rig to others; a watch ends as `done`; a session with a board is closed.
 #[utoipa::path(post, path = "/v1/calibrations/{id}/cancel", tag = "calibrations", params(("id" = String, Path)),
     responses((status = 202, description = "It will stop", body = CalibrationRun),
         (status = 404, description = "Unknown", body = ProblemBody, content_type = "application/problem+json"),
@@ -299,9 +288,23 @@ pub async fn cancel_calibration(
     Ok((StatusCode::ACCEPTED, Json(CalibrationRun::new(&record))).into_response())
 }
 
+/// Delete a calibration
+///
+/// With its files and, of a rig, with all its views. One that is not at its end has to be cancelled first.
+#[utoipa::path(delete, path = "/v1/calibrations/{id}", tag = "calibrations", params(("id" = String, Path)),
+    responses((status = 204, description = "Gone"),
+        (status = 404, description = "Unknown", body = ProblemBody, content_type = "application/problem+json"),
+        (status = 409, description = "It is not at its end", body = ProblemBody, content_type = "application/problem+json"),
+        (status = 503, description = "The disk says no", body = ProblemBody, content_type = "application/problem+json")))]
+pub async fn delete_calibration(Shared(app): Shared<App>, id: OnePart) -> Result<StatusCode, Problem> {
+    let Part(id) = id.map_err(|_| unknown())?;
+    app.scanner.delete_calibration(&id).await?;
+    Ok(StatusCode::NO_CONTENT)
+}
+
 /// A file of a calibration
 ///
-/// `report.json`, `noise.toml`, `sync.toml`, `polarization.toml`, plots, and whatever else its `artifacts` list.
+/// `calibration.toml`, `opencv.yaml`, `report.json`, `noise.toml`, `sync.toml`, `polarization.toml`, plots, and whatever else its `artifacts` list.
 #[utoipa::path(get, path = "/v1/calibrations/{id}/{name}", tag = "calibrations",
     params(("id" = String, Path), ("name" = String, Path, description = "Name of the file")),
     responses(
@@ -321,7 +324,7 @@ pub async fn get_calibration_file(
         return Err(unknown());
     }
     let record = find(&app, &id)?;
-    if !record.state.is_terminal() {
+    if record.state == CalibrationState::Running {
         return Err(Kind::NotFinished.with("the calibration is running; ask again when it has ended"));
     }
     // Only names that the record lists lead to a file.

@@ -11,6 +11,7 @@ mod pages;
 mod problem;
 mod scans;
 mod server;
+mod sessions;
 mod system;
 mod tls;
 mod wire;
@@ -155,8 +156,15 @@ fn router() -> OpenApiRouter<App> {
         .routes(routes!(calibrations::post_noise))
         .routes(routes!(calibrations::post_sync))
         .routes(routes!(calibrations::post_polarization))
-        .routes(routes!(calibrations::post_rig))
-        .routes(routes!(calibrations::get_calibration, calibrations::post_unknown))
+        .routes(routes!(sessions::post_rig))
+        .routes(routes!(sessions::post_view))
+        .routes(routes!(sessions::delete_view))
+        .routes(routes!(sessions::post_solve))
+        .routes(routes!(
+            calibrations::get_calibration,
+            calibrations::post_unknown,
+            calibrations::delete_calibration
+        ))
         .routes(routes!(calibrations::cancel_calibration))
         .routes(routes!(calibrations::get_calibration_file))
         .routes(routes!(system::livez))

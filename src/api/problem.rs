@@ -27,6 +27,8 @@ pub enum Kind {
     UnknownScan,
     /// There is no calibration of this identity.
     UnknownCalibration,
+    /// The session has no such view.
+    UnknownView,
     /// The scan has no such file.
     NoArtifact,
     /// The address takes other methods.
@@ -57,8 +59,6 @@ pub enum Kind {
     QueueFull,
     /// A defect.
     Internal,
-    /// Not part of this service.
-    Unsupported,
     /// The rig cannot scan.
     NotReady,
     /// Too many requests at once.
@@ -76,6 +76,7 @@ const TABLE: [(Kind, &str, u16, &str); 26] = [
     (Kind::NotFound, "not-found", 404, "there is nothing here"),
     (Kind::UnknownScan, "unknown-scan", 404, "there is no such scan"),
     (Kind::UnknownCalibration, "unknown-calibration", 404, "there is no such calibration"),
+    (Kind::UnknownView, "unknown-view", 404, "there is no such view"),
     (Kind::NoArtifact, "no-artifact", 404, "there is no such file"),
     (Kind::Method, "method-not-allowed", 405, "this address takes other methods"),
     (Kind::Timeout, "request-timeout", 408, "the request took too long to arrive"),
@@ -91,7 +92,6 @@ const TABLE: [(Kind, &str, u16, &str); 26] = [
     (Kind::KeyReused, "idempotency-key-reused", 422, "the Idempotency-Key was used for another request"),
     (Kind::QueueFull, "queue-full", 429, "too many scans wait"),
     (Kind::Internal, "internal", 500, "a defect of this service"),
-    (Kind::Unsupported, "not-implemented", 501, "this service cannot do that"),
     (Kind::NotReady, "not-ready", 503, "the rig cannot scan now"),
     (Kind::Overloaded, "overloaded", 503, "too many requests at once"),
     (Kind::NoFrame, "no-frame", 503, "there is no frame to look at"),
@@ -219,6 +219,13 @@ impl From<Denied> for Problem {
                     .with(format!("the calibration is {state}, which does not allow this"))
                     .and("state", state)
             }
+            Denied::UnknownView => {
+                Kind::UnknownView.with("GET the calibration: its `session` lists its views")
+            }
+            Denied::NoSession => Kind::State.with("only the calibration of a rig has views and is solved"),
+            Denied::SessionOpen(id) => Kind::State
+                .with(format!("session {id} is open; go on with it, or cancel it first"))
+                .and("session", id),
             Denied::NoBundle => Kind::State.with("the scan left no frames"),
             Denied::Storage(message) => {
                 let reasons = json!([{ "type": "storage", "message": message }]);

@@ -1,9 +1,10 @@
-//! Calibrations of the rig that need no board: measured, written into a folder, accepted or refused. No terminal: command
-//! line and service come through here.
+//! Calibrations of the rig: measured, written into a folder, accepted or refused. No terminal: command line and service
+//! come through here.
 
 pub mod noise;
 pub mod output;
 pub mod polarization;
+pub mod rig;
 pub mod sync;
 
 use std::{
@@ -27,6 +28,8 @@ pub enum Task {
     Noise,
     /// Timing of the projector.
     Sync,
+    /// A step of a session with a board.
+    Rig(rig::Task),
     /// Polarization, at one angle.
     Polarization(polarization::Task),
     /// Watch H and V while somebody turns the polarizer; writes nothing.
@@ -77,6 +80,7 @@ pub fn run(
         Task::Polarization(task) => {
             polarization::run(Output::create(out)?, rig, settings, task, cancel, &mut doing)
         }
+        Task::Rig(task) => rig::run(task, out, rig, settings, cancel, &mut doing),
         Task::Watch { coupon, limit } => {
             doing("watching H and V");
             let (mut turning, begun) = (Turning::default(), Instant::now());

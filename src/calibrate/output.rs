@@ -41,6 +41,8 @@ pub struct Outcome {
     pub refused: Vec<String>,
     /// Whether there is a file for scans; `None` where more has to be measured before there is anything to judge.
     pub accepted: Option<bool>,
+    /// The session that it is a step of, as it stands now.
+    pub session: Option<super::rig::SessionState>,
 }
 
 impl Output {
@@ -99,7 +101,7 @@ impl Output {
         self.writer.finish_plain().map_err(failed)?;
         let Summary { lines, refused, unfinished } = summary;
         let accepted = (!unfinished || !refused.is_empty()).then_some(refused.is_empty());
-        Ok(Outcome { files: self.files, report, lines, refused, accepted })
+        Ok(Outcome { files: self.files, report, lines, refused, accepted, session: None })
     }
 }
 

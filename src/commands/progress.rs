@@ -17,6 +17,11 @@ impl Bar {
         Self { bar }
     }
 
+    /// Number of frames that there will be.
+    pub fn length(&self, frames: u64) {
+        self.bar.set_length(frames);
+    }
+
     /// Number of frames that are done.
     pub fn frames(&self, done: u64) {
         self.bar.set_position(done);

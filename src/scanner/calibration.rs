@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
 use super::record::Cause;
-use crate::calibrate::{Light, Outcome, polarization::turning_advice};
+use crate::calibrate::{Light, Outcome, polarization::turning_advice, rig::SessionState};
 
 /// What is calibrated.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
@@ -16,6 +16,8 @@ pub enum CalibrationKind {
     Noise,
     /// Polarization of projector and polarizer.
     Polarization,
+    /// Optics of camera and projector and the pose between them.
+    Rig,
 }
 
 impl CalibrationKind {
@@ -25,6 +27,7 @@ impl CalibrationKind {
             Self::Sync => "sync",
             Self::Noise => "noise",
             Self::Polarization => "polarization",
+            Self::Rig => "rig",
         }
     }
 }
@@ -33,6 +36,8 @@ impl CalibrationKind {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum CalibrationState {
+    /// A session waits for its next step; others may use the rig.
+    Open,
     /// It has the rig.
     Running,
     /// It came to its end, accepted or refused.
@@ -49,6 +54,7 @@ impl CalibrationState {
     /// Name in answers.
     pub fn name(self) -> &'static str {
         match self {
+            Self::Open => "open",
             Self::Running => "running",
             Self::Done => "done",
             Self::Failed => "failed",
@@ -59,7 +65,7 @@ impl CalibrationState {
 
     /// Whether nothing comes after it.
     pub fn is_terminal(self) -> bool {
-        self != Self::Running
+        !matches!(self, Self::Open | Self::Running)
     }
 }
 
@@ -106,6 +112,9 @@ pub struct CalibrationRecord {
     pub watch: bool,
     /// The latest value of a watch.
     pub live: Option<LiveValue>,
+    /// Of a rig: the board, its views, and what is still missing.
+    #[serde(default)]
+    pub session: Option<SessionState>,
     /// Whether it can be trusted; `null` before its end, and where more angles have to be measured first.
     pub accepted: Option<bool>,
     /// Why it is not accepted.
@@ -137,6 +146,7 @@ impl CalibrationRecord {
             with: Vec::new(),
             watch: false,
             live: None,
+            session: None,
             accepted: None,
             refused: Vec::new(),
             error: None,
@@ -154,7 +164,11 @@ impl CalibrationRecord {
 
     /// Takes over what was found.
     pub fn adopt(&mut self, outcome: Outcome) {
-        let Outcome { files, lines, refused, accepted, .. } = outcome;
+        let Outcome { files, lines, refused, accepted, session, .. } = outcome;
+        if session.is_some() {
+            self.session = session;
+            self.error = None;
+        }
         (self.files, self.summary, self.refused) = (files, lines, refused);
         self.accepted = accepted.filter(|_| !self.watch);
     }
@@ -180,15 +194,17 @@ mod tests {
 
     #[test]
     fn names_are_those_in_json_and_ends_never_change() {
-        use CalibrationKind::{Noise, Polarization, Sync};
-        use CalibrationState::{Cancelled, Done, Failed, Interrupted, Running};
-        for kind in [Noise, Sync, Polarization] {
+        use CalibrationKind::{Noise, Polarization, Rig, Sync};
+        use CalibrationState::{Cancelled, Done, Failed, Interrupted, Open, Running};
+        for kind in [Noise, Sync, Polarization, Rig] {
             assert_eq!(serde_json::to_value(kind).unwrap(), kind.name());
         }
         let states = [Running, Done, Failed, Cancelled, Interrupted];
         for state in states {
             assert_eq!(serde_json::to_value(state).unwrap(), state.name());
         }
+        assert_eq!(serde_json::to_value(Open).unwrap(), Open.name());
+        assert!(!Open.is_terminal() && !Running.is_terminal());
         for first in &states[1..] {
             for second in states {
                 let mut record = CalibrationRecord::new("a".into(), Noise, "t".into());

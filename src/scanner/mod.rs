@@ -42,7 +42,7 @@ pub use calibration::{CalibrationKind, CalibrationRecord, CalibrationState, Live
 pub use events::EventLog;
 pub use heartbeat::Heartbeat;
 pub use metrics::Metrics;
-pub use owner::{CalibrationAsk, Change, Denied, Submit};
+pub use owner::{CalibrationAsk, Change, Denied, SessionAsk, Submit};
 pub use preview::{Exposure, Picture, Preview};
 pub use record::{Cause, Progress, Record, Series, is_id};
 pub use service::{Scanner, Threads, start};

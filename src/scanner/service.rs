@@ -16,10 +16,11 @@ use super::{
     EventLog, Heartbeat, Metrics, Preview, Record, Snapshot,
     calibration::CalibrationRecord,
     disk, finish,
-    owner::{CalibrationAsk, Change, Denied, Message, Outlets, Owner, Submit},
+    owner::{CalibrationAsk, Change, Denied, Message, Outlets, Owner, SessionAsk, Submit},
     rig,
 };
 use crate::{
+    calibrate::rig::Step,
     config::Settings,
     engine::Shown,
     store::{Index, Library},
@@ -155,6 +156,21 @@ impl Scanner {
     /// Asks for a calibration, which begins at once or is refused.
     pub async fn calibrate(&self, ask: CalibrationAsk) -> Result<Arc<CalibrationRecord>, Denied> {
         self.ask(|reply| Message::Calibrate(Box::new(ask), reply)).await
+    }
+
+    /// Opens a session with a board.
+    pub async fn open_session(&self, ask: SessionAsk) -> Result<Arc<CalibrationRecord>, Denied> {
+        self.ask(|reply| Message::OpenSession(Box::new(ask), reply)).await
+    }
+
+    /// Goes on with a session, at once or not at all.
+    pub async fn session_step(&self, id: &str, step: Step) -> Result<Arc<CalibrationRecord>, Denied> {
+        self.ask(|reply| Message::SessionStep(id.to_owned(), step, reply)).await
+    }
+
+    /// Deletes a calibration and its files.
+    pub async fn delete_calibration(&self, id: &str) -> Result<(), Denied> {
+        self.ask(|reply| Message::DeleteCalibration(id.to_owned(), reply)).await
     }
 
     /// Stops a calibration.

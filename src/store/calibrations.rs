@@ -28,6 +28,39 @@ impl Calibrations {
         self.0.join(id)
     }
 
+    /// Where the views of a session are; there from now on.
+    ///
+    /// # Errors
+    /// The disk says no.
+    pub fn session(&self, id: &str) -> Result<PathBuf, StorageError> {
+        debug_assert!(is_id(id), "{id}");
+        let folder = self.views(id);
+        fs::create_dir_all(&folder).map_err(|error| StorageError::file("create folder", &folder, error))?;
+        Ok(folder)
+    }
+
+    fn views(&self, id: &str) -> PathBuf {
+        self.0.join(format!("{id}.session"))
+    }
+
+    /// Removes a calibration with all its files. What is known of it goes first: without it the rest is nothing.
+    ///
+    /// # Errors
+    /// The disk says no.
+    pub fn remove(&self, id: &str) -> Result<(), StorageError> {
+        let gone = |result: io::Result<()>, path: &Path| match result {
+            Err(error) if error.kind() != io::ErrorKind::NotFound => {
+                Err(StorageError::file("remove", path, error))
+            }
+            _ => Ok(()),
+        };
+        let record = self.0.join(format!("{id}.json"));
+        gone(fs::remove_file(&record), &record)?;
+        [self.files(id), self.views(id)]
+            .iter()
+            .try_for_each(|folder| gone(fs::remove_dir_all(folder), folder))
+    }
+
     /// Writes what is known of a calibration. All or nothing.
     ///
     /// # Errors
@@ -76,7 +109,22 @@ impl Calibrations {
     }
 
     fn settle(&self, mut record: CalibrationRecord, now: &str) -> CalibrationRecord {
-        if record.state.is_terminal() {
+        if record.session.is_some()
+            && let Err(error) = bundle::remove_stale_partials(&self.views(&record.id))
+        {
+            tracing::warn!(%error, "what a view left still takes space");
+        }
+        if record.state.is_terminal() || record.state == CalibrationState::Open {
+            return record;
+        }
+        if record.session.is_some() {
+            // Its views are on the disk: only the step that was under way is lost.
+            record.state = CalibrationState::Open;
+            record.doing = None;
+            record.blame("interrupted", "the service ended in the middle of a step; ask for it again");
+            if let Err(error) = self.write(&record) {
+                tracing::warn!(%error, "an interrupted step is not noted as such");
+            }
             return record;
         }
         record.end(CalibrationState::Interrupted, now.to_owned());

@@ -13,6 +13,7 @@ mod refusals;
 #[allow(dead_code, reason = "the other suite needs more of it")]
 mod rig;
 mod scans;
+mod sessions;
 #[allow(dead_code, reason = "the long runs print what is measured here")]
 mod soak;
 mod storage;

@@ -2,12 +2,15 @@
 
 use std::path::PathBuf;
 
-use super::{
-    board,
-    result::{self, Subject},
-    views::{Views, name_of, read_picture},
+use super::{board, limits::Limits, output::print};
+use crate::{
+    calibrate::{
+        Output,
+        rig::{Subject, Views, name_of, read_picture, solve},
+    },
+    calibration::boards::DetectSettings,
+    engine::Failure,
 };
-use crate::{calibrate::Output, calibration::boards::DetectSettings, engine::Failure};
 
 /// Arguments.
 #[derive(Debug, clap::Args)]
@@ -22,7 +25,7 @@ pub struct Args {
     #[arg(long, value_name = "FILE", num_args = 1.., required = true)]
     images: Vec<PathBuf>,
     #[command(flatten)]
-    limits: result::Limits,
+    limits: Limits,
     /// Folder for the result; must be absent or empty.
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
@@ -38,10 +41,6 @@ pub fn run(args: &Args, json: bool) -> Result<u8, Failure> {
         let picture = read_picture(path)?;
         views.add(&name_of(path, &args.images), &board, &picture, None, DetectSettings::default())?;
     }
-    result::solve(
-        &Subject { board: &board, views: &views, gates, baseline_mm: None },
-        output,
-        &args.out,
-        json,
-    )
+    let outcome = solve(&Subject { board: &board, views: &views, gates, baseline_mm: None }, output)?;
+    Ok(print(&args.out, &outcome, json))
 }

@@ -2,13 +2,10 @@
 
 mod board;
 mod camera;
+mod limits;
 mod output;
-mod pictures;
 mod polarization;
-mod result;
 mod rig;
-mod session;
-mod views;
 
 use clap::Subcommand;
 

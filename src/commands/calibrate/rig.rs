@@ -5,27 +5,21 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use polscan_patterns::Mode;
-
-use super::{
-    board,
-    result::{self, Subject, setup},
-    session::Session,
-    views::{Views, name_of, white_picture},
-};
+use super::{board, limits::Limits, output::print};
 use crate::{
     app::{Rig, holding},
-    calibrate::Output,
+    calibrate::{
+        Output,
+        rig::{Session, Shot, Subject, Views, name_of, setup, solve, take},
+    },
     calibration::{
         boards::{Board, DetectSettings},
         rig::{Gates, guidance},
     },
     commands::{progress::Bar, scan::cancel_on_interrupt},
     config::{ConfigError, Settings},
-    engine::{Failure, Label, Results, Scan, new_id, rig_failure},
-    pipeline::PipelineError,
+    engine::{Failure, rig_failure},
     sequencer::{CancelFlag, Progress},
-    store::BundleWriter,
 };
 
 /// Arguments.
@@ -53,7 +47,7 @@ pub struct Args {
     #[arg(long, value_name = "NAME")]
     drop: Vec<String>,
     #[command(flatten)]
-    limits: result::Limits,
+    limits: Limits,
     /// Folder for the result; must be absent or empty.
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
@@ -79,12 +73,13 @@ pub fn run(
     };
     board.measured_mm = args.measured_mm.or(board.measured_mm);
     let gates = args.limits.given()?.or(session.as_ref().map(|session| session.gates)).unwrap_or_default();
+    let known_mm = session.as_ref().and_then(|session| session.baseline_mm);
+    let baseline_mm = args.limits.baseline_mm.or(known_mm);
     let views = match args.poses {
         Some(poses) => {
             let settings = load(args.config.as_deref())?;
             let keep = args.session.as_deref();
-            Taking { board: &board, gates, baseline_mm: args.limits.baseline_mm, keep }
-                .all(&settings, poses)?
+            Taking { board: &board, gates, baseline_mm, keep }.all(&settings, poses)?
         }
         None => {
             let paths = match (&session, &args.session) {
@@ -94,8 +89,8 @@ pub fn run(
             read(&paths, &args.drop, &board)?
         }
     };
-    let subject = Subject { board: &board, views: &views, gates, baseline_mm: args.limits.baseline_mm };
-    result::solve(&subject, output, &args.out, json)
+    let subject = Subject { board: &board, views: &views, gates, baseline_mm };
+    Ok(print(&args.out, &solve(&subject, output)?, json))
 }
 
 /// Reads recorded views, but those to drop.
@@ -123,12 +118,12 @@ struct Taking<'a> {
 impl Taking<'_> {
     /// Takes all views; what is still missing is said before each.
     fn all(&self, settings: &Settings, poses: u32) -> Result<Views, Failure> {
-        let session_file = self.keep.map(|folder| folder.join(super::session::FILE_NAME));
+        let session_file = self.keep.map(|folder| folder.join(Session::FILE_NAME));
         if let Some(taken) = session_file.filter(|file| file.exists()) {
             let message = format!("{} holds a session already; give another folder", taken.display());
             return Err(Failure::storage("keep the session", message));
         }
-        let mut session = Session::new(&settings.raw.rig.name, self.board, self.gates);
+        let mut session = Session::new(&settings.raw.rig.name, self.board, self.gates, self.baseline_mm);
         let mut views = Views::default();
         let cancel = CancelFlag::default();
         cancel_on_interrupt(&cancel);
@@ -144,7 +139,7 @@ impl Taking<'_> {
                 }
                 None => {
                     self.ask(&views, number + 1, poses)?;
-                    Settings { mode: Mode::Gray, ..settings.clone() }
+                    settings.clone()
                 }
             };
             let rig = match &mut rig {
@@ -191,37 +186,14 @@ impl Taking<'_> {
         views: &mut Views,
         cancel: &CancelFlag,
     ) -> Result<(), Failure> {
-        // A calibration that there may be already is what is to be found anew.
-        let settings = Settings { calibration: None, ..settings.clone() };
-        let scan = Scan::prepare(&settings, &[], rig)?;
-        let bar = Bar::new(scan.frames() as u64);
+        let bar = Bar::new(1);
         bar.say(name.to_owned());
-        let mut progress = |progress: Progress<'_>| {
-            if let Progress::Captured { done, .. } = progress {
-                bar.frames(done as u64);
-            }
+        let mut progress = |progress: Progress<'_>| match progress {
+            Progress::Started { frames, .. } => bar.length(frames as u64),
+            Progress::Captured { done, .. } => bar.frames(done as u64),
+            _ => {}
         };
-        let taken = scan.capture(rig, &mut progress, cancel);
-        if let Some(reason) = taken.failure() {
-            return Err(Failure::data(format!("take the view {name}"), reason.message.clone()));
-        }
-        let failed = |error: PipelineError| Failure::data(format!("decode the view {name}"), error);
-        let look = |results: &Results| {
-            let (job, decoded) = (results.job, &results.outcome.decoded);
-            views.set_projector(name, (job.decode.column.size(), job.decode.row.size()))?;
-            let size = (job.decode.width, job.decode.height);
-            let Some(picture) = white_picture(job.roles, job.planes, size) else {
-                return Err(Failure::data(format!("use the view {name}"), "it has no white frame"));
-            };
-            views.add(name, self.board, &picture, Some(decoded), DetectSettings::default())
-        };
-        scan.examine(&taken, look).map_err(failed)??;
-        if let Some(folder) = self.keep {
-            let failed = |error| Failure::storage(format!("keep the view {name}"), error);
-            let writer = BundleWriter::create(&folder.join(name), None, scan.bytes()).map_err(failed)?;
-            let label = Label { id: new_id(), label: Some(name.into()), ..Label::default() };
-            scan.finish(&taken, label, writer)?;
-        }
-        Ok(())
+        let shot = Shot { name, board: self.board, settings, keep: self.keep };
+        take(&shot, rig, views, &mut progress, cancel)
     }
 }

@@ -32,6 +32,7 @@ impl CalibrationAsk {
         let kind = match &self.task {
             Task::Noise => CalibrationKind::Noise,
             Task::Sync => CalibrationKind::Sync,
+            Task::Rig(_) => CalibrationKind::Rig,
             Task::Polarization(_) | Task::Watch { .. } => CalibrationKind::Polarization,
         };
         let mut record = CalibrationRecord::new(uuid::Uuid::now_v7().to_string(), kind, now());
@@ -56,7 +57,8 @@ impl Owner {
         }
     }
 
-    pub(super) fn calibrate(&mut self, ask: CalibrationAsk) -> Result<Arc<CalibrationRecord>, Denied> {
+    /// Whether the rig is there and free for a calibration, and the disk for its files.
+    pub(super) fn admit_calibration(&mut self) -> Result<(), Denied> {
         self.look_at_storage();
         let situation = self.situation();
         let mut obstacles = situation.obstacles;
@@ -66,16 +68,27 @@ impl Owner {
         if !obstacles.is_empty() {
             return Err(Denied::Refused(Refusal::NotReady(obstacles)));
         }
-        if let Some(holder) = situation.holder {
-            return Err(Denied::Refused(Refusal::Busy(holder)));
-        }
+        situation.holder.map_or(Ok(()), |holder| Err(Denied::Refused(Refusal::Busy(holder))))
+    }
+
+    pub(super) fn calibrate(&mut self, ask: CalibrationAsk) -> Result<Arc<CalibrationRecord>, Denied> {
+        self.admit_calibration()?;
         let record = ask.record();
+        self.start_calibration(record, ask.task)
+    }
+
+    /// Gives the rig to a calibration that was admitted.
+    pub(super) fn start_calibration(
+        &mut self,
+        record: CalibrationRecord,
+        task: Task,
+    ) -> Result<Arc<CalibrationRecord>, Denied> {
         let (id, store) = (record.id.clone(), self.library.calibrations());
         // Known on the disk before the rig moves: a crash leaves an interrupted calibration, not none.
         store.write(&record).map_err(|error| Denied::Storage(chain(&error)))?;
         Arc::make_mut(&mut self.calibrations).insert(id.clone(), Arc::new(record));
         let cancel = CancelFlag::default();
-        let job = Job { id: id.clone(), task: ask.task, cancel: cancel.clone(), folder: store.files(&id) };
+        let job = Job { id: id.clone(), task, cancel: cancel.clone(), folder: store.files(&id) };
         let _ = self.out.rig.send(rig::Command::Calibrate(Box::new(job)));
         self.calibrating = Some(Calibrating { id: id.clone(), cancel, looks: 0 });
         self.rig.state = RigState::Busy;
@@ -84,13 +97,14 @@ impl Owner {
         self.calibration(&id)
     }
 
-    pub(super) fn cancel_calibration(&self, id: &str) -> Result<Arc<CalibrationRecord>, Denied> {
+    pub(super) fn cancel_calibration(&mut self, id: &str) -> Result<Arc<CalibrationRecord>, Denied> {
         let record = self.calibration(id)?;
         match record.state {
             CalibrationState::Running => {
                 self.calibrating.iter().filter(|one| one.id == id).for_each(|one| one.cancel.cancel());
                 Ok(record)
             }
+            CalibrationState::Open => self.close_session(id),
             CalibrationState::Cancelled => Ok(record),
             // A watch has no other end.
             CalibrationState::Done if record.watch => Ok(record),
@@ -110,7 +124,7 @@ impl Owner {
         })
     }
 
-    fn calibration(&self, id: &str) -> Result<Arc<CalibrationRecord>, Denied> {
+    pub(super) fn calibration(&self, id: &str) -> Result<Arc<CalibrationRecord>, Denied> {
         self.calibrations.get(id).cloned().ok_or(Denied::UnknownCalibration)
     }
 
@@ -134,9 +148,17 @@ impl Owner {
     fn calibration_ended(&mut self, id: &str, result: Result<Box<crate::calibrate::Outcome>, Broken>) {
         let stopped = self.calibrating.take().is_some_and(|one| one.cancel.is_cancelled());
         self.release();
-        let (stopping, watches) =
-            (self.stopping, self.calibrations.get(id).is_some_and(|record| record.watch));
-        self.edit_calibration(id, |record| {
+        let Some(mut record) = self.calibrations.get(id).map(|record| record.as_ref().clone()) else {
+            return;
+        };
+        if record.session.is_some() {
+            let state = self.session_state(&mut record, result, stopped);
+            match state.is_terminal() {
+                true => record.end(state, now()),
+                false => record.state = state,
+            }
+        } else {
+            let (stopping, watches) = (self.stopping, record.watch);
             let state = match result {
                 Ok(outcome) => {
                     record.adopt(*outcome);
@@ -158,7 +180,8 @@ impl Owner {
                 }
             };
             record.end(state, now());
-        });
+        }
+        self.edit_calibration(id, |known| *known = record);
         if let Some(record) = self.calibrations.get(id) {
             tracing::info!(id, state = record.state.name(), accepted = record.accepted, "calibration");
         }
@@ -186,7 +209,7 @@ impl Owner {
         }
     }
 
-    fn edit_calibration(&mut self, id: &str, change: impl FnOnce(&mut CalibrationRecord)) {
+    pub(super) fn edit_calibration(&mut self, id: &str, change: impl FnOnce(&mut CalibrationRecord)) {
         if let Some(record) = Arc::make_mut(&mut self.calibrations).get_mut(id) {
             change(Arc::make_mut(record));
         }
@@ -200,7 +223,7 @@ impl Owner {
     }
 
     /// Gives a calibration a new revision and tells.
-    fn touch_calibration(&mut self, id: &str) {
+    pub(super) fn touch_calibration(&mut self, id: &str) {
         self.revise_calibration(id);
         self.tell_calibration(id);
     }

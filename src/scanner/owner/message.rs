@@ -5,8 +5,9 @@ use std::{sync::Arc, time::Duration};
 use polscan_patterns::Mode;
 use tokio::sync::oneshot;
 
-use super::CalibrationAsk;
+use super::{CalibrationAsk, SessionAsk};
 use crate::{
+    calibrate::rig::Step,
     engine::Shown,
     scanner::{
         admission::Refusal,
@@ -58,6 +59,12 @@ pub enum Denied {
     NoBundle,
     /// There is no such calibration.
     UnknownCalibration,
+    /// The session has no such view.
+    UnknownView,
+    /// The calibration takes no views.
+    NoSession,
+    /// Another session is open.
+    SessionOpen(String),
     /// The calibration has come to its end.
     CalibrationEnded(CalibrationState),
     /// The disk says no.
@@ -102,6 +109,12 @@ pub enum Message {
     Hold(bool, Reply<usize>),
     /// Calibrate.
     Calibrate(Box<CalibrationAsk>, Reply<Arc<CalibrationRecord>>),
+    /// Open a session with a board.
+    OpenSession(Box<SessionAsk>, Reply<Arc<CalibrationRecord>>),
+    /// Go on with a session.
+    SessionStep(String, Step, Reply<Arc<CalibrationRecord>>),
+    /// Delete a calibration.
+    DeleteCalibration(String, Reply<()>),
     /// Stop a calibration.
     CancelCalibration(String, Reply<Arc<CalibrationRecord>>),
     /// Hold a picture.

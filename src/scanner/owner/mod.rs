@@ -9,6 +9,7 @@ mod message;
 mod news;
 mod requests;
 mod room;
+mod sessions;
 
 use std::{
     collections::{BTreeMap, VecDeque},
@@ -62,6 +63,7 @@ const GIB: f64 = (1u64 << 30) as f64;
 
 pub use calibrations::CalibrationAsk;
 pub use message::{Change, Denied, Message, Reply, Submit};
+pub use sessions::SessionAsk;
 use {
     calibrations::Calibrating,
     message::{Answer, answer},
@@ -220,6 +222,9 @@ impl Owner {
             Message::Change(id, change, reply) => Some(answer(self.change(&id, change), reply)),
             Message::Hold(held, reply) => Some(answer(Ok(self.hold(held)), reply)),
             Message::Calibrate(ask, reply) => Some(answer(self.calibrate(*ask), reply)),
+            Message::OpenSession(ask, reply) => Some(answer(self.open_session(&ask), reply)),
+            Message::SessionStep(id, step, reply) => Some(answer(self.session_step(&id, step), reply)),
+            Message::DeleteCalibration(id, reply) => Some(answer(self.delete_calibration(&id), reply)),
             Message::CancelCalibration(id, reply) => Some(answer(self.cancel_calibration(&id), reply)),
             Message::Show(shown, name, reply) => self.show(shown, name, reply),
             Message::Preview => {

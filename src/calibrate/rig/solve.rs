@@ -1,15 +1,12 @@
 //! From views to files: what a calibration came to, or why there is none.
 
-use std::{
-    path::{Path, PathBuf},
-    time::SystemTime,
-};
+use std::time::SystemTime;
 
 use serde_json::{Value, json};
 
-use super::{output::print, pictures, views::Views};
+use super::{pictures, views::Views};
 use crate::{
-    calibrate::{Output, Summary},
+    calibrate::{Outcome, Output, Summary},
     calibration::{
         boards::Board,
         rig::{Calibrated, Gates, Refused, Setup, calibrate, guidance},
@@ -21,27 +18,6 @@ use crate::{
 
 /// Schema of the report.
 const SCHEMA: &str = "polscan.calibration-report/1";
-
-/// When a calibration is accepted.
-#[derive(Debug, clap::Args)]
-pub struct Limits {
-    /// File of limits that a calibration must keep, TOML; those it leaves out are the usual ones.
-    #[arg(long, value_name = "FILE")]
-    gates: Option<PathBuf>,
-    /// Distance between camera and projector as measured with a ruler: shows a board of another size.
-    #[arg(long, value_name = "MM")]
-    pub baseline_mm: Option<f64>,
-}
-
-impl Limits {
-    /// The limits; `None` where no file names any.
-    pub fn given(&self) -> Result<Option<Gates>, Failure> {
-        let Some(path) = &self.gates else { return Ok(None) };
-        let operation = format!("read the limits {}", path.display());
-        let text = std::fs::read_to_string(path).map_err(|error| Failure::data(operation.clone(), error))?;
-        toml::from_str(&text).map(Some).map_err(|error| Failure::data(operation, error))
-    }
-}
 
 /// What is calibrated, from what.
 pub struct Subject<'a> {
@@ -70,8 +46,11 @@ pub fn setup(views: &Views, gates: Gates, baseline_mm: Option<f64>) -> Result<Se
     Ok(Setup { gates, baseline_mm, ..setup })
 }
 
-/// Solves, writes everything and prints; returns the exit code.
-pub fn solve(subject: &Subject<'_>, mut output: Output, out: &Path, json: bool) -> Result<u8, Failure> {
+/// Solves and writes everything.
+///
+/// # Errors
+/// No view, or the disk; a calibration that is refused is an outcome.
+pub fn solve(subject: &Subject<'_>, mut output: Output) -> Result<Outcome, Failure> {
     let Subject { board, views, .. } = *subject;
     let setup = setup(views, subject.gates, subject.baseline_mm)?;
     let result = calibrate(&views.views, &setup);
@@ -94,8 +73,7 @@ pub fn solve(subject: &Subject<'_>, mut output: Output, out: &Path, json: bool) 
         true => lines.push("accepted".into()),
         false => lines.extend(missing.missing.iter().map(|missing| format!("missing: {missing}"))),
     }
-    let outcome = output.finish(report, Summary { lines, refused, ..Summary::default() })?;
-    Ok(print(out, &outcome, json))
+    output.finish(report, Summary { lines, refused, ..Summary::default() })
 }
 
 fn dated(calibrated: &Calibrated) -> Calibration {

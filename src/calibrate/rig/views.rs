@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use polscan_patterns::{Mode, Role};
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use crate::{
     calibration::{
@@ -20,7 +20,7 @@ use crate::{
 const MOST_POINTS: usize = 8000;
 
 /// A view that is of no use, and why.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Unusable {
     /// What the user calls it.
     pub name: String,
@@ -29,7 +29,7 @@ pub struct Unusable {
 }
 
 /// How well a board was seen.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Seen {
     /// What the user calls the view.
     pub name: String,
@@ -44,7 +44,7 @@ pub struct Seen {
 }
 
 /// What was seen in all pictures.
-#[derive(Debug, Default)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Views {
     /// Views of the board.
     pub views: Vec<View>,
@@ -137,6 +137,24 @@ impl Views {
         self.add(name, board, &picture, Some(&outcome.decoded), settings)
     }
 
+    /// Adds views of the same camera and projector.
+    ///
+    /// # Errors
+    /// Sizes differ.
+    pub fn join(&mut self, other: &Self) -> Result<(), Failure> {
+        let differ = |one: Option<(u32, u32)>, other: Option<(u32, u32)>| matches!((one, other), (Some(one), Some(other)) if one != other);
+        if differ(self.camera, other.camera) || differ(self.projector, other.projector) {
+            let message = "its pictures have another size than those of the views before it; take all views of a session \
+                           with one camera and one projector";
+            return Err(Failure::data("use the view", message));
+        }
+        (self.camera, self.projector) = (self.camera.or(other.camera), self.projector.or(other.projector));
+        self.views.extend(other.views.iter().cloned());
+        self.seen.extend(other.seen.iter().cloned());
+        self.unusable.extend(other.unusable.iter().cloned());
+        Ok(())
+    }
+
     /// Notes the size of the projector, which all views share.
     pub fn set_projector(&mut self, name: &str, size: (u32, u32)) -> Result<(), Failure> {
         let before = *self.projector.get_or_insert(size);
@@ -189,6 +207,12 @@ pub fn read_picture(path: &Path) -> Result<Picture, Failure> {
         grey => grey.to_luma8().into_raw().into_iter().map(f32::from).collect(),
     };
     Ok(Picture::new(width, height, data))
+}
+
+/// The number in the name of a view of a session.
+pub fn number_of(name: &str) -> Option<u32> {
+    let digits = name.strip_prefix("view-")?.trim_end_matches(".json");
+    digits.bytes().all(|byte| byte.is_ascii_digit()).then(|| digits.parse().ok()).flatten()
 }
 
 /// What a file or folder is called in messages.
