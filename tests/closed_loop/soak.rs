@@ -104,5 +104,6 @@ fn a_camera_that_is_torn_away_for_ten_minutes_leaves_nothing_behind() {
         |some: &[Holdings]| some.iter().map(|held| held.memory_kib as f64).sum::<f64>() / some.len() as f64;
     let (middle, last) = (mean(&held[20..30]), mean(&held[50..]));
     println!("resident memory: {middle:.0} KiB after 20 to 30 losses, {last:.0} KiB after 50 to 60");
-    assert!(last < 1.02 * middle, "{held:?}");
+    // A hundred scans only begin to fill the index's page cache of 2000 KiB; with five hundred it is full (`docs/service.md`).
+    assert!(last - middle < 2000.0, "{held:?}");
 }
