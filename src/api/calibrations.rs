@@ -24,7 +24,7 @@ use crate::{
     geometry::{Calibration, ReadHints},
     report::NamedRegion,
     scanner::{CalibrationAsk, CalibrationRecord, CalibrationState, is_id},
-    store::{calibrations::Calibrations as Store, source::read_calibration},
+    store::{calibrations::Calibrations as Store, library::chain, source::read_calibration},
 };
 
 const WATCH_S: std::ops::RangeInclusive<f64> = 1.0..=3600.0;
@@ -87,6 +87,8 @@ impl CalibrationRun {
 pub struct Calibrations {
     /// The file that scans use.
     calibrations: Vec<CalibrationInUse>,
+    /// Why the file that scans use cannot be read.
+    fault: Option<String>,
     /// What this service calibrated, the newest first.
     runs: Vec<CalibrationRun>,
 }
@@ -95,14 +97,13 @@ pub struct Calibrations {
 ///
 /// The file that scans use, and all calibrations that this service made, the newest first.
 #[utoipa::path(get, path = "/v1/calibrations", tag = "calibrations",
-    responses((status = 200, description = "Calibrations", body = Calibrations),
-        (status = 503, description = "The file cannot be read", body = ProblemBody, content_type = "application/problem+json")))]
+    responses((status = 200, description = "Calibrations", body = Calibrations)))]
 pub async fn get_calibrations(Shared(app): Shared<App>) -> Result<Json<Calibrations>, Problem> {
     let snapshot = app.scanner.snapshot();
     // Identities sort by time.
     let runs = snapshot.calibrations.values().rev().map(|record| CalibrationRun::new(record)).collect();
     let Some(rig) = app.settings.calibration.clone() else {
-        return Ok(Json(Calibrations { calibrations: Vec::new(), runs }));
+        return Ok(Json(Calibrations { calibrations: Vec::new(), fault: None, runs }));
     };
     let hints = ReadHints {
         camera_size: snapshot.rig.camera.as_ref().map(|camera| (camera.sensor_width, camera.sensor_height)),
@@ -112,14 +113,21 @@ pub async fn get_calibrations(Shared(app): Shared<App>) -> Result<Json<Calibrati
     };
     let path = rig.path.clone();
     let read = app.blocking(move || read_calibration(&path, &hints)).await?;
-    let calibration: Calibration = read.map_err(|error| Kind::NotReady.with(error.to_string()))?;
+    let calibration: Calibration = match read {
+        Ok(calibration) => calibration,
+        // What was measured is there all the same.
+        Err(error) => {
+            let fault = Some(chain(&error));
+            return Ok(Json(Calibrations { calibrations: Vec::new(), fault, runs }));
+        }
+    };
     let in_use = CalibrationInUse {
         id: calibration.id(),
         file: rig.path.display().to_string(),
         kind: "rig",
         quality: json!(crate::report::CalibrationReport::new(None, &calibration.quality)),
     };
-    Ok(Json(Calibrations { calibrations: vec![in_use], runs }))
+    Ok(Json(Calibrations { calibrations: vec![in_use], fault: None, runs }))
 }
 
 async fn begin(app: &App, task: Task, with: Vec<String>) -> Result<Response, Problem> {

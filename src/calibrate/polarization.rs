@@ -13,7 +13,7 @@ use crate::{
     engine::Failure,
     measure::{
         files::{DeviceKey, Document, PolarizationFile},
-        polarization::{self as measure, Measured, Set},
+        polarization::{self as measure, Conditions, Measured, Set},
     },
     report::NamedRegion,
     sequencer::CancelFlag,
@@ -60,6 +60,7 @@ pub fn run(
         edges: task.angle_deg.abs() <= EDGES_WITHIN_DEG,
     };
     let measured = measure::measure(rig, settings, &what, cancel, progress)?;
+    check_alike(&task.earlier, &measured.set)?;
     let sets: Vec<&Set> = task.earlier.iter().chain([&measured.set]).collect();
     let turns: Vec<Turn> = sets.iter().map(|set| set.turn).collect();
     let found = solve(&turns);
@@ -85,6 +86,23 @@ pub fn run(
     });
     let lines = lines(&measured, found.as_ref());
     output.finish(report, Summary { lines, refused: refused.into_iter().collect(), unfinished })
+}
+
+/// Brightness is compared from angle to angle, so that nothing else may have changed it.
+fn check_alike(earlier: &[Set], this: &Set) -> Result<(), Failure> {
+    let Some(here) = &this.taken else { return Ok(()) };
+    let other = earlier.iter().find(|set| set.taken.as_ref().is_some_and(|taken| taken != here));
+    let Some((set, taken)) = other.and_then(|set| Some((set, set.taken.as_ref()?))) else { return Ok(()) };
+    let words = |with: &Conditions| {
+        format!("{} and {} at {} us and {} dB", with.camera, with.projector, with.exposure_us, with.gain_db)
+    };
+    let message = format!(
+        "the run at {} degrees was taken with {}, this one with {}; measure all angles alike",
+        set.turn.angle_deg,
+        words(taken),
+        words(here)
+    );
+    Err(Failure::data("join the angles", message))
 }
 
 /// What to do with the polarizer that stands `off` degrees from the darkest V that was seen, if that is known yet.
@@ -245,5 +263,34 @@ fn plot(turns: &[Turn], found: Option<&Found>) -> Plot {
         y_name: "light, brightest = 1".into(),
         series: all,
         ..Plot::default()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn angles_that_were_taken_otherwise_are_not_joined() {
+        let key =
+            |serial: &str| DeviceKey { driver: "sim".into(), model: "twin".into(), serial: serial.into() };
+        let set = |exposure_us: Option<f64>| Set {
+            turn: Turn { angle_deg: 30.0, light: [1.0; 3], sigma: [0.1; 3] },
+            black: 0.0,
+            white: 3.0,
+            h: 1.0,
+            v: 2.0,
+            crosstalk: 0.0,
+            taken: exposure_us.map(|exposure_us| Conditions {
+                camera: key("camera"),
+                projector: key("projector"),
+                exposure_us,
+                gain_db: 0.0,
+            }),
+        };
+        let this = set(Some(2000.0));
+        assert!(check_alike(&[set(Some(2000.0)), set(None)], &this).is_ok());
+        let refused = check_alike(&[set(Some(2000.0)), set(Some(4000.0))], &this).unwrap_err().chain();
+        assert!(refused.contains("30 degrees") && refused.contains("4000 us"), "{refused}");
     }
 }

@@ -12,7 +12,7 @@ use polscan_drivers::{
 use polscan_patterns::Polarization;
 use serde::{Deserialize, Serialize};
 
-use super::{Bench, bench::mean};
+use super::{Bench, bench::mean, files::DeviceKey};
 use crate::{
     app::Rig,
     config::Settings,
@@ -50,6 +50,23 @@ pub struct Set {
     pub v: f64,
     /// White less the sum of its channels, as a share of white: what one panel does to the light of another.
     pub crosstalk: f64,
+    /// What it was taken with; older reports do not say.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub taken: Option<Conditions>,
+}
+
+/// What decides the brightness of everything: angles that are joined must share it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Conditions {
+    /// Camera.
+    pub camera: DeviceKey,
+    /// Projector.
+    pub projector: DeviceKey,
+    /// Exposure time in microseconds.
+    pub exposure_us: f64,
+    /// Gain in decibel.
+    pub gain_db: f64,
 }
 
 impl Set {
@@ -168,6 +185,7 @@ struct Stage<'b, 'r> {
     pixels: Vec<u32>,
     /// Level of no light, or of the black picture where that is not known.
     black_dn: f64,
+    conditions: Conditions,
 }
 
 /// Pictures of a stage.
@@ -217,7 +235,13 @@ impl<'b, 'r> Stage<'b, 'r> {
             ));
         }
         let black_dn = applied.black_level_dn.unwrap_or(black);
-        Ok(Self { bench, states: settings.polarization, width, pixels, black_dn })
+        let conditions = Conditions {
+            camera: bench.camera().into(),
+            projector: bench.projector().into(),
+            exposure_us: applied.settings.exposure_us,
+            gain_db: applied.settings.gain_db,
+        };
+        Ok(Self { bench, states: settings.polarization, width, pixels, black_dn, conditions })
     }
 
     /// Mean level of a picture over the chosen pixels, above no light, and its sigma.
@@ -251,7 +275,8 @@ impl<'b, 'r> Stage<'b, 'r> {
         };
         let white = above(4);
         let crosstalk = (white - turn.light.iter().sum::<f64>()) / white.max(1e-9);
-        Ok(Set { turn, black, white, h: above(5), v: above(6), crosstalk })
+        let taken = Some(self.conditions.clone());
+        Ok(Set { turn, black, white, h: above(5), v: above(6), crosstalk, taken })
     }
 
     /// Mean image of a slide of one state.

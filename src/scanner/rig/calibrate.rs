@@ -74,8 +74,13 @@ impl Open {
         };
         // The camera was set for the measurement: the next scan and the preview want it back as it was.
         if broken.is_none() {
-            broken = self.prepared.restore(settings, &mut self.rig).err().map(|error| error.chain());
+            let restore = || self.prepared.restore(settings, &mut self.rig);
+            broken = match catch_unwind(AssertUnwindSafe(restore)) {
+                Ok(restored) => restored.err().map(|error| error.chain()),
+                Err(panic) => Some(format!("a defect of this program: {}", said(&*panic))),
+            };
         }
+        self.tell_projector(shared);
         // Before anybody hears of the end, and may ask for more.
         if let Some(message) = &broken {
             shared.down(message);
