@@ -1,0 +1,8 @@
+"""Resting, for both clients."""
+
+import time
+
+import anyio
+
+sleep = time.sleep
+wait = anyio.sleep
