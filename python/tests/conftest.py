@@ -4,8 +4,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from polscan import Scanner
 from service import Service
+
+from polscan import Scanner
 
 MakeService = Callable[..., Service]
 

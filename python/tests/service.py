@@ -66,7 +66,15 @@ class Service:
         where = self.folder / "address"
         where.unlink(missing_ok=True)
         with (self.folder / "log").open("ab") as log:
-            command = [program(), "serve", "--json", "--config", self.config, "--address-file", where]
+            command = [
+                str(program()),
+                "serve",
+                "--json",
+                "--config",
+                str(self.config),
+                "--address-file",
+                str(where),
+            ]
             self.process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=log)
         self.until(lambda: where.exists() and where.read_text().strip(), "the service does not listen")
         self.address = where.read_text().strip()
@@ -94,5 +102,14 @@ class Service:
 
 def token(folder: Path, scope: str) -> str:
     """A new token of the file `tokens`."""
-    command = [program(), "token", "add", f"for-{scope}", "--scope", scope, "--file", folder / "tokens"]
-    return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+    command = [
+        str(program()),
+        "token",
+        "add",
+        f"for-{scope}",
+        "--scope",
+        scope,
+        "--file",
+        str(folder / "tokens"),
+    ]
+    return str(subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip())

@@ -11,7 +11,7 @@ from pathlib import Path
 FOLDER = Path(__file__).resolve().parents[1] / "src" / "polscan"
 WORDS = {
     "AsyncScanner": "Scanner", "AsyncScan": "Scan", "AsyncCalibration": "Calibration",
-    "AsyncIterator": "Iterator", "AsyncClient": "Client", "AsyncBaseTransport": "BaseTransport",
+    "AsyncClient": "Client", "AsyncGenerator": "Generator", "AsyncBaseTransport": "BaseTransport",
     "__aenter__": "__enter__", "__aexit__": "__exit__", "aclose": "close", "aread": "read",
     "aiter_bytes": "iter_bytes", "aiter_raw": "iter_raw",
 }  # fmt: skip
@@ -22,9 +22,10 @@ def synchronous(source: str) -> str:
     """The same without `async` and `await`."""
     source = HEAD + source.split("\n", 1)[1]
     source = re.sub(r"\b(async|await) ", "", source)
+    source = re.sub(r"AsyncGenerator\[(\w+), None\]", r"Generator[\1, None, None]", source)
     source = source.replace("_pause.wait(", "_pause.sleep(")
     source = re.sub(r"\w+", lambda word: WORDS.get(word[0], word[0]), source)
-    return source.replace("import Iterator, Iterable", "import Iterable, Iterator")
+    return source
 
 
 def main() -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import ssl
 import tempfile
-from collections.abc import AsyncIterator, Iterable
+from collections.abc import AsyncGenerator, Iterable
 from datetime import datetime
 from pathlib import Path
 from types import TracebackType
@@ -176,7 +176,7 @@ class AsyncScanner:
         since: datetime | None = None,
         until: datetime | None = None,
         page_size: int = 50,
-    ) -> AsyncIterator[AsyncScan]:
+    ) -> AsyncGenerator[AsyncScan, None]:
         """All scans that fit, the newest first, fetched page by page as they are used up.
 
         `state`: one or several of them; `tags`: all of which a scan must have; `since` and `until`: when it was accepted.
@@ -239,7 +239,7 @@ class AsyncScanner:
         answer = await self._send("GET", "/v1/preview.jpg")
         return Preview.of(answer.content, answer.headers)
 
-    async def previews(self) -> AsyncIterator[Preview]:
+    async def previews(self) -> AsyncGenerator[Preview, None]:
         """The latest frames one after the other; who is slow misses some. Ends where the connection does."""
         async with self._client.stream("GET", "/v1/preview.mjpeg") as answer:
             if answer.status_code != 200:
@@ -251,7 +251,7 @@ class AsyncScanner:
 
     async def events(
         self, *, after: int | None = None, timeout_s: float | None = None
-    ) -> AsyncIterator[Event]:
+    ) -> AsyncGenerator[Event, None]:
         """Follows everything that changes, over lost connections and restarts of the service, without loss.
 
         `after`: the number of the last event that is known already, such as `status().revision`; left out, that of the moment in
@@ -445,7 +445,7 @@ class AsyncScan:
             await self.refresh()
         return self.info
 
-    async def follow(self, timeout_s: float | None = None) -> AsyncIterator[ScanInfo]:
+    async def follow(self, timeout_s: float | None = None) -> AsyncGenerator[ScanInfo, None]:
         """The scan as it changes from now on, frame by frame, until its end.
 
         The next change may take `timeout_s`.
@@ -461,10 +461,16 @@ class AsyncScan:
                 if event.kind == "progress":
                     self.info = ScanInfo.parse({**self.info.raw, **event.data})
                 else:
-                    await self.refresh()
+                    # An event may be heard before the service answers requests with what it says.
+                    await self._refresh_past(event.id or 0)
                 yield self.info
                 if self.info.ended:
                     return
+
+    async def _refresh_past(self, revision: int) -> None:
+        deadline = Deadline(self.scanner._timeout_s, f"what event {revision} says of scan {self.id}")
+        while (await self.refresh()).revision < revision:
+            await _pause.wait(deadline.left(0.02))
 
     async def cancel(self) -> ScanInfo:
         """Stops it; frames that were taken are kept."""
@@ -608,7 +614,7 @@ class AsyncCalibration:
         self.info = CalibrationInfo.parse(await self.scanner._get(self.href))
         return self.info
 
-    async def follow(self, timeout_s: float | None = None) -> AsyncIterator[CalibrationInfo]:
+    async def follow(self, timeout_s: float | None = None) -> AsyncGenerator[CalibrationInfo, None]:
         """The calibration as it changes from now on, until its end. The next change may take `timeout_s`."""
         info = await self.refresh()
         yield info
@@ -616,7 +622,13 @@ class AsyncCalibration:
             return
         async for event in self.scanner.events(after=info.revision, timeout_s=timeout_s):
             if event.kind == "gap" or event.data.get("id") == self.id:
-                info = await self.refresh()
+                # An event may be heard before the service answers requests with what it says.
+                deadline = Deadline(
+                    self.scanner._timeout_s, f"what event {event.id} says of calibration {self.id}"
+                )
+                said = CalibrationInfo.parse(event.data).revision if event.kind == "calibration" else 0
+                while (info := await self.refresh()).revision < said:
+                    await _pause.wait(deadline.left(0.02))
                 yield info
                 if info.ended:
                     return

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import ssl
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable
 from datetime import datetime
 from pathlib import Path
 from types import TracebackType
@@ -176,7 +176,7 @@ class Scanner:
         since: datetime | None = None,
         until: datetime | None = None,
         page_size: int = 50,
-    ) -> Iterator[Scan]:
+    ) -> Generator[Scan, None, None]:
         """All scans that fit, the newest first, fetched page by page as they are used up.
 
         `state`: one or several of them; `tags`: all of which a scan must have; `since` and `until`: when it was accepted.
@@ -239,7 +239,7 @@ class Scanner:
         answer = self._send("GET", "/v1/preview.jpg")
         return Preview.of(answer.content, answer.headers)
 
-    def previews(self) -> Iterator[Preview]:
+    def previews(self) -> Generator[Preview, None, None]:
         """The latest frames one after the other; who is slow misses some. Ends where the connection does."""
         with self._client.stream("GET", "/v1/preview.mjpeg") as answer:
             if answer.status_code != 200:
@@ -251,7 +251,7 @@ class Scanner:
 
     def events(
         self, *, after: int | None = None, timeout_s: float | None = None
-    ) -> Iterator[Event]:
+    ) -> Generator[Event, None, None]:
         """Follows everything that changes, over lost connections and restarts of the service, without loss.
 
         `after`: the number of the last event that is known already, such as `status().revision`; left out, that of the moment in
@@ -445,7 +445,7 @@ class Scan:
             self.refresh()
         return self.info
 
-    def follow(self, timeout_s: float | None = None) -> Iterator[ScanInfo]:
+    def follow(self, timeout_s: float | None = None) -> Generator[ScanInfo, None, None]:
         """The scan as it changes from now on, frame by frame, until its end.
 
         The next change may take `timeout_s`.
@@ -461,10 +461,16 @@ class Scan:
                 if event.kind == "progress":
                     self.info = ScanInfo.parse({**self.info.raw, **event.data})
                 else:
-                    self.refresh()
+                    # An event may be heard before the service answers requests with what it says.
+                    self._refresh_past(event.id or 0)
                 yield self.info
                 if self.info.ended:
                     return
+
+    def _refresh_past(self, revision: int) -> None:
+        deadline = Deadline(self.scanner._timeout_s, f"what event {revision} says of scan {self.id}")
+        while (self.refresh()).revision < revision:
+            _pause.sleep(deadline.left(0.02))
 
     def cancel(self) -> ScanInfo:
         """Stops it; frames that were taken are kept."""
@@ -608,7 +614,7 @@ class Calibration:
         self.info = CalibrationInfo.parse(self.scanner._get(self.href))
         return self.info
 
-    def follow(self, timeout_s: float | None = None) -> Iterator[CalibrationInfo]:
+    def follow(self, timeout_s: float | None = None) -> Generator[CalibrationInfo, None, None]:
         """The calibration as it changes from now on, until its end. The next change may take `timeout_s`."""
         info = self.refresh()
         yield info
@@ -616,7 +622,13 @@ class Calibration:
             return
         for event in self.scanner.events(after=info.revision, timeout_s=timeout_s):
             if event.kind == "gap" or event.data.get("id") == self.id:
-                info = self.refresh()
+                # An event may be heard before the service answers requests with what it says.
+                deadline = Deadline(
+                    self.scanner._timeout_s, f"what event {event.id} says of calibration {self.id}"
+                )
+                said = CalibrationInfo.parse(event.data).revision if event.kind == "calibration" else 0
+                while (info := self.refresh()).revision < said:
+                    _pause.sleep(deadline.left(0.02))
                 yield info
                 if info.ended:
                     return
