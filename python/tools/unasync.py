@@ -24,8 +24,7 @@ def synchronous(source: str) -> str:
     source = re.sub(r"\b(async|await) ", "", source)
     source = re.sub(r"AsyncGenerator\[(\w+), None\]", r"Generator[\1, None, None]", source)
     source = source.replace("_pause.wait(", "_pause.sleep(")
-    source = re.sub(r"\w+", lambda word: WORDS.get(word[0], word[0]), source)
-    return source
+    return re.sub(r"\w+", lambda word: WORDS.get(word[0], word[0]), source)
 
 
 def main() -> int:
