@@ -1,5 +1,5 @@
 # Two commands are all that is needed: `make run` and `make test`. Both install what is missing first.
-.PHONY: run serve test captures foreign-plane closed-loop faults soak kills service-figures fuzz accuracy api-fuzz systemd v4l2 deb setup install ci
+.PHONY: run serve test captures foreign-plane python closed-loop faults soak kills service-figures fuzz accuracy api-fuzz systemd v4l2 deb setup install ci
 
 run: ## build, serve the simulated rig, scan it over REST, say where the results are
 	@scripts/install build
@@ -37,6 +37,10 @@ service-figures: ## what the service costs: time to the first pattern, overhead,
 foreign-plane: ## check the decoder from outside, with an independent numpy model
 	@scripts/install test
 	@scripts/foreign-plane
+
+python: ## check the Python package, its cookbook and its notebook against the service on the simulated rig
+	@scripts/install test
+	@scripts/python
 
 closed-loop: ## scan at full size through the real window and a camera in software, about 2 minutes
 	@scripts/install test

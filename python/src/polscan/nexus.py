@@ -31,8 +31,8 @@ except ImportError as error:
 _MAPS = {
     "column": ("projector_column", "pixel", "projector column that lit the pixel, centres of pixels at integers"),
     "row": ("projector_row", "pixel", "projector row that lit the pixel, centres of pixels at integers"),
-    "modulation": ("modulation", "", "contrast between the two polarizations"),
-    "residual": ("residual", "", "disagreement of the frames with what was projected, in standard deviations"),
+    "modulation": ("modulation", "DN", "light of H less that of V (white less black in mode gray)"),
+    "residual": ("residual", "", "what pairs of frames miss the references by, root mean square in standard deviations"),
     "class": ("class", "", "; ".join(f"{number} {name}" for number, name in enumerate(CLASSES))),
     "mask": ("mask", "", "1 where the pixel was measured"),
 }  # fmt: skip

@@ -58,12 +58,16 @@ class PolscanDevice(StandardReadable, Triggerable):
         timeout_s: float = 300.0,
         **client: Any,  # noqa: ANN401 - those of AsyncScanner
     ) -> None:
-        self._scanner = AsyncScanner(url, **client)
+        self._url = url.rstrip("/")
+        self._client = client
+        self._scanner: AsyncScanner | None = None
         self._folder = None if folder is None else Path(folder)
         self._request: dict[str, Any] = {"label": label, "tags": tags, "queue": queue}
         self._timeout_s = timeout_s
         self._scan: AsyncScan | None = None
         self._mocked = False
+        self._triggered = False
+        self._given_up = False
         self.mode = soft_signal_rw(str, "")
         self.exposure_us = soft_signal_rw(float, 0.0, units="us")
         self.version, self._set_version = soft_signal_r_and_setter(str, "")
@@ -90,21 +94,44 @@ class PolscanDevice(StandardReadable, Triggerable):
         """Sees whether the service is there. A mocked device asks nobody, and its scans are nothing."""
         self._mocked = bool(mock)
         if not self._mocked:
-            status = await asyncio.wait_for(self._scanner.status(), timeout)
+            async with AsyncScanner(self._url, **self._client) as scanner:
+                status = await asyncio.wait_for(scanner.status(), timeout)
             self._set_version(status.version)
         await super().connect(mock, timeout, force_reconnect)
 
     @AsyncStatus.wrap
     async def trigger(self) -> None:
         """Scans; done as soon as the object may move."""
-        self._scan = None
+        self._scan, self._given_up = None, False
         if self._mocked:
             return
+        self._triggered = True
+        try:
+            await self._acquire()
+        except ScanFailed:
+            # A scan that the plan gave up is nobody's fault.
+            if not self._given_up:
+                raise
+        finally:
+            self._triggered = False
+            if self._given_up:
+                await self._close()
+
+    async def _acquire(self) -> None:
         mode, exposure_us = await asyncio.gather(self.mode.get_value(), self.exposure_us.get_value())
+        # Kept for the plan: `unstage` closes its connections.
+        self._scanner = self._scanner or AsyncScanner(self._url, **self._client)
         self._scan = await self._scanner.scan(
             mode=mode or None, exposure_us=exposure_us or None, **self._request
         )
+        if self._given_up:
+            await self._scan.cancel()
         await self._scan.acquired(self._timeout_s)
+
+    async def _close(self) -> None:
+        scanner, self._scanner, self._scan = self._scanner, None, None
+        if scanner is not None:
+            await scanner.aclose()
 
     async def read(self) -> dict[str, Reading[Any]]:
         """Waits for the result of the latest trigger and says where it is."""
@@ -114,7 +141,7 @@ class PolscanDevice(StandardReadable, Triggerable):
 
     async def _take(self, scan: AsyncScan) -> None:
         info = await scan.done(self._timeout_s, check=False)
-        bundle, cloud = f"{self._scanner.url}{scan.href}", f"{self._scanner.url}{scan.href}/cloud.ply"
+        bundle, cloud = f"{self._url}{scan.href}", f"{self._url}{scan.href}/cloud.ply"
         if self._folder is not None:
             path = self._folder / info.id
             # Without a manifest there is nothing to fetch; state and reasons say why.
@@ -132,9 +159,13 @@ class PolscanDevice(StandardReadable, Triggerable):
 
     @AsyncStatus.wrap
     async def unstage(self) -> None:
-        """Stops a scan that nobody waits for any more."""
-        if self._scan is not None and self._scan.info.acquired is None and not self._scan.info.ended:
-            # It may have come to its end just now.
-            with contextlib.suppress(Problem):
-                await self._scan.cancel()
+        """Stops a scan that nobody waits for any more, and closes the connections."""
+        if self._triggered:
+            self._given_up = True
+            if self._scan is not None:
+                # It may have come to its end just now.
+                with contextlib.suppress(Problem):
+                    await self._scan.cancel()
+        else:
+            await self._close()
         await super().unstage()
