@@ -12,6 +12,7 @@ from typing import Any
 
 import nbclient
 import nbformat
+import numpy as np
 import pytest
 import trustme
 from service import ROOT, Service
