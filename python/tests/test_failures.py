@@ -307,7 +307,10 @@ def test_a_calibration_whose_answer_is_lost_is_not_begun_twice(service: Service)
         with pytest.raises(polscan.ConnectionLost):
             scanner.calibrate_noise()
         assert len(proxy.requests) == 1
-        runs = scanner.calibrations().runs
+        # The service may answer a request before its lists tell of it.
+        end = time.monotonic() + 10
+        while len(runs := scanner.calibrations().runs) == before and time.monotonic() < end:
+            time.sleep(0.05)
         assert len(runs) == before + 1
         scanner.calibration(runs[0].id).done(30)
 

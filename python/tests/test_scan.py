@@ -236,6 +236,8 @@ def test_a_calibration_runs_and_leaves_files(scanner: Scanner, tmp_path: Path) -
     assert listed.calibrations[0].kind == "rig"
     assert calibration.id in [run.id for run in listed.runs]
     assert scanner.calibration(calibration.id).info == info
+    calibration.delete()
+    assert calibration.id not in [run.id for run in scanner.calibrations().runs]
 
 
 def test_a_watch_of_the_polarizer_ends_when_it_is_told_to(scanner: Scanner) -> None:

@@ -651,6 +651,10 @@ class AsyncCalibration:
         self.info = CalibrationInfo.parse(_requests.document(answer))
         return self.info
 
+    async def delete(self) -> None:
+        """Deletes it with its files; one that runs has to be cancelled first."""
+        await self.scanner._send("DELETE", self.href)
+
     async def fetch(self, name: str, to: str | Path) -> Path:
         """Streams a file of the calibration to `to`, and returns the path."""
         path = Path(to)

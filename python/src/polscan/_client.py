@@ -651,6 +651,10 @@ class Calibration:
         self.info = CalibrationInfo.parse(_requests.document(answer))
         return self.info
 
+    def delete(self) -> None:
+        """Deletes it with its files; one that runs has to be cancelled first."""
+        self.scanner._send("DELETE", self.href)
+
     def fetch(self, name: str, to: str | Path) -> Path:
         """Streams a file of the calibration to `to`, and returns the path."""
         path = Path(to)

@@ -246,7 +246,7 @@ class CalibrationInfo(Document):
     id: str
     kind: str
     state: str
-    """`running`, `done`, `failed`, `cancelled` or `interrupted`."""
+    """`open` (a session with a board, between its steps), `running`, `done`, `failed`, `cancelled`, `interrupted`."""
     revision: int
     created: datetime
     steps: int
@@ -255,6 +255,8 @@ class CalibrationInfo(Document):
     doing: str | None = None
     angle_deg: float | None = None
     live: LiveValue | None = None
+    session: dict[str, Any] | None = None
+    """What is still missing and which views there are, of a session with a board."""
     accepted: bool | None = None
     """Whether it can be trusted; nothing before its end."""
     refused: tuple[str, ...] = ()
@@ -269,7 +271,7 @@ class CalibrationInfo(Document):
     @property
     def ended(self) -> bool:
         """Whether it will never change again."""
-        return self.state != "running"
+        return self.state not in ("open", "running")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -288,6 +290,8 @@ class Calibrations(Document):
 
     calibrations: tuple[CalibrationInUse, ...]
     runs: tuple[CalibrationInfo, ...]
+    fault: str | None = None
+    """Why the file that scans use cannot be read."""
 
 
 @dataclass(frozen=True)
