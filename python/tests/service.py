@@ -20,7 +20,7 @@ sys.path.insert(0, str(ROOT / "tests" / "python"))
 
 def program() -> Path:
     """The program under test: `POLSCAN_BINARY`, or the one that the Rust suite was built with."""
-    target = Path(os.environ.get("CARGO_TARGET_DIR", ROOT / "target"))
+    target = ROOT / os.environ.get("CARGO_TARGET_DIR", "target")
     path = Path(os.environ.get("POLSCAN_BINARY", target / "debug" / "polscan"))
     if not path.is_file():
         raise FileNotFoundError(f"there is no {path}; build it (`cargo build`) or name it in POLSCAN_BINARY")
@@ -91,6 +91,13 @@ class Service:
             if self.process.poll() is not None or time.monotonic() > end:
                 raise AssertionError(f"{otherwise}:\n{self.log()}")
             time.sleep(0.02)
+
+    def stop(self) -> None:
+        """Asks it to end, and waits until it has."""
+        assert self.process is not None
+        self.process.terminate()
+        assert self.process.wait(60) == 0
+        self.process = None
 
     def kill(self) -> None:
         """Ends it in the middle of whatever it does."""

@@ -356,6 +356,20 @@ def test_a_service_that_dies_and_comes_back_is_waited_for(make_service: MakeServ
         assert len(scanner.scan(mode="fast").cloud()) > 0
 
 
+def test_a_service_that_is_restarted_in_good_order_is_waited_for(make_service: MakeService) -> None:
+    service = make_service(("sim.pacing", '"real-time"')).start()
+    ended: list[str] = []
+    with Scanner(service.url, patience_s=60) as scanner:
+        scan = scanner.scan(mode="fast")
+        waiting = threading.Thread(target=lambda: ended.append(scan.done(60, check=False).state))
+        waiting.start()
+        service.stop()
+        service.start()
+        waiting.join()
+        # A service that is asked to end lets the running scan come to its own end first.
+        assert ended == ["done"]
+
+
 def test_a_wait_that_breaks_off_goes_on(slow: Service) -> None:
     with Proxy(slow.address, b"wait=done", []) as proxy, Scanner(proxy.url) as scanner:
         scan = scanner.scan(mode="pse", queue=True)
