@@ -231,6 +231,9 @@ impl From<Denied> for Problem {
                 let reasons = json!([{ "type": "storage", "message": message }]);
                 Kind::NotReady.with(message).and("reasons", reasons)
             }
+            Denied::NoSuchPicture(message) => Kind::Invalid
+                .with(format!("show: {message}"))
+                .and("errors", json!([{ "key": "show", "message": message }])),
             Denied::Rig(message) => {
                 let reasons = json!([{ "type": "rig", "message": message }]);
                 Kind::NotReady.with(message).and("reasons", reasons)

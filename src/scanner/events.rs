@@ -35,17 +35,20 @@ struct Recent {
     first: u64,
     /// Number of the next event.
     next: u64,
+    /// Number of the latest event that readers may have.
+    told: u64,
 }
 
 impl EventLog {
     /// A log whose first event will have the number `next`.
     pub fn new(next: u64) -> Self {
         let next = next.max(1);
-        let recent = Recent { events: VecDeque::new(), first: next, next };
+        let recent = Recent { events: VecDeque::new(), first: next, next, told: next - 1 };
         Self { recent: Mutex::new(recent), latest: watch::Sender::new(next - 1) }
     }
 
-    /// Adds an event, which must have the number that [`next`](Self::next) gave: there is one that adds.
+    /// Adds an event, which must have the number that [`next`](Self::next) gave: there is one that adds. Nobody sees it
+    /// before [`tell`](Self::tell).
     pub fn add(&self, event: Event) {
         let id = event.id;
         let mut recent = self.recent.lock().unwrap_or_else(PoisonError::into_inner);
@@ -56,8 +59,17 @@ impl EventLog {
             recent.events.pop_front();
             recent.first += 1;
         }
+    }
+
+    /// Lets readers have all events so far, once everybody can see what they tell of.
+    pub fn tell(&self) {
+        let mut recent = self.recent.lock().unwrap_or_else(PoisonError::into_inner);
+        let latest = recent.next - 1;
+        let news = std::mem::replace(&mut recent.told, latest) != latest;
         drop(recent);
-        self.latest.send_replace(id);
+        if news {
+            self.latest.send_replace(latest);
+        }
     }
 
     /// Number of the next event.
@@ -77,7 +89,8 @@ impl EventLog {
             return None;
         }
         let skip = usize::try_from(cursor + 1 - recent.first).unwrap_or(usize::MAX);
-        Some(recent.events.iter().skip(skip).cloned().collect())
+        let told = |event: &&Arc<Event>| event.id <= recent.told;
+        Some(recent.events.iter().skip(skip).take_while(told).cloned().collect())
     }
 
     /// Number of the latest event, now and whenever there is a new one.
@@ -103,6 +116,9 @@ mod tests {
         for id in 101..106 {
             log.add(event(id));
         }
+        assert_eq!((log.after(100), *log.latest().borrow()), (Some(Vec::new()), 100), "not yet told");
+        log.tell();
+        assert_eq!(*log.latest().borrow(), 105);
         let ids =
             |cursor| log.after(cursor).map(|events| events.iter().map(|event| event.id).collect::<Vec<_>>());
         assert_eq!(ids(100), Some(vec![101, 102, 103, 104, 105]));
@@ -118,6 +134,7 @@ mod tests {
         for id in 1..=IN_MEMORY as u64 + 10 {
             log.add(event(id));
         }
+        log.tell();
         assert_eq!(log.after(9), None);
         let all = log.after(10).unwrap();
         assert_eq!((all.len(), all[0].id), (IN_MEMORY, 11));

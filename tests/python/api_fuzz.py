@@ -4,7 +4,7 @@
 
 Starts the service on a small simulated rig and lets schemathesis ask, with a fixed seed: first without tokens, then with
 a token of every scope, then with none and a wrong one. Fails on a status of 5xx that is not the documented 503 of a rig
-that cannot scan or 501 of what is not there, on answers that the document does not describe, and on any line of the log
+that cannot scan, on answers that the document does not describe, and on any line of the log
 at error level. /v1/events and /v1/preview.mjpeg never end, so what they answer to odd parameters is asked here by hand.
 """
 

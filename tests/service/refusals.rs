@@ -51,7 +51,10 @@ fn wrong_requests_get_problems_that_say_what_is_wrong() {
     daemon.request("PUT", "/v1/scans", &json!({})).expect(405);
     daemon.get("/v1/scans?wait=never").expect(422);
     daemon.request("PUT", "/v1/projector", &json!({ "show": "unicorn" })).expect(422);
-    assert_eq!(daemon.post("/v1/calibrations/rig", &json!({})).expect(501).slug(), "not-implemented");
+    daemon.ready();
+    // A pattern, but none of this projector's.
+    daemon.request("PUT", "/v1/projector", &json!({ "show": "column-99" })).expect(422);
+    assert_eq!(daemon.post("/v1/calibrations/rig", &json!({})).expect(422).slug(), "invalid");
     daemon.post("/v1/calibrations/odd", &json!({})).expect(404);
     daemon.post("/v1/calibrations/odd/cancel", &json!({})).expect(404);
     daemon.get("/v1/calibrations/odd").expect(404);

@@ -22,6 +22,10 @@ fn events_tell_a_scan_from_its_beginning_to_its_end() {
         match event.kind.as_str() {
             "scan" if event.data["id"] == id.as_str() => {
                 assert_eq!(event.data["revision"], event.id);
+                assert!(
+                    daemon.state(&id)["revision"].as_u64() >= Some(event.id),
+                    "whoever asks at once sees it"
+                );
                 states.push(event.data["state"].as_str().unwrap().to_owned());
             }
             "progress" => {

@@ -185,7 +185,7 @@ impl Owner {
         if let Some(record) = self.calibrations.get(id) {
             tracing::info!(id, state = record.state.name(), accepted = record.accepted, "calibration");
         }
-        // On the disk, then for all to see, then told: whoever hears of the end fetches the files at once.
+        // On the disk before it is told: whoever hears of the end fetches the files at once.
         let revised = self.revise_calibration(id);
         let written = revised.map(|record| self.library.calibrations().write(&record));
         if let Some(Err(error)) = written {
@@ -195,7 +195,6 @@ impl Owner {
                 "the end of a calibration is not noted: a restart calls it interrupted"
             );
         }
-        self.publish();
         self.tell_calibration(id);
     }
 

@@ -69,6 +69,8 @@ pub enum Denied {
     CalibrationEnded(CalibrationState),
     /// The disk says no.
     Storage(String),
+    /// The projector has no such picture.
+    NoSuchPicture(String),
     /// The rig says no.
     Rig(String),
 }

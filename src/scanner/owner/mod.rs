@@ -378,5 +378,7 @@ impl Owner {
             stopping: self.stopping,
         };
         self.out.snapshot.send_replace(Arc::new(snapshot));
+        // Whoever hears of a change and asks at once sees it.
+        self.out.events.tell();
     }
 }

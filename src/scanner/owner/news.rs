@@ -50,7 +50,11 @@ impl Owner {
     }
 
     fn shown(&mut self, name: String, held: Result<(), Failure>, reply: Reply<()>) -> Answer {
-        let held = held.map_err(|failure| Denied::Rig(failure.chain()));
+        let held = held.map_err(|failure| match failure {
+            // No fault of the rig: this projector has no such picture.
+            Failure::Setup { .. } | Failure::Data { .. } => Denied::NoSuchPicture(failure.chain()),
+            failure => Denied::Rig(failure.chain()),
+        });
         // A scan or a calibration that has begun meanwhile has taken the picture away.
         if held.is_ok() && self.active.is_none() && self.calibrating.is_none() {
             self.rig.showing = (name != "black").then_some(name);
