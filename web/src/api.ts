@@ -3,6 +3,7 @@
 export interface Cause {
   type: string;
   message: string;
+  evidence?: Record<string, unknown>;
 }
 
 export interface Progress {
@@ -67,6 +68,7 @@ export interface Device {
 
 export interface Run {
   id: string;
+  revision: number;
   kind: string;
   state: "running" | "done" | "failed" | "cancelled" | "interrupted";
   created: string;
@@ -85,11 +87,12 @@ export interface Run {
 /** The parts of `report.json` that the page tells. */
 export interface Report {
   verdict: string;
-  reasons: { type: string; message: string; severity?: string }[];
+  reasons: Cause[];
   notes: string[];
   simulated: boolean;
-  pixels: Record<string, number>;
-  points: number;
+  /** `null` where the capture did not come to its end. */
+  pixels: Record<string, number> | null;
+  points: number | null;
   planes?: { name: string; points: number; rmse_mm: number | null; bow_mm: number | null }[];
 }
 

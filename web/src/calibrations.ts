@@ -2,7 +2,7 @@
 
 import { get, local, post, type Run } from "./api";
 import { badge, field, guarded, h, moment, say } from "./dom";
-import { listen } from "./events";
+import { current, listen } from "./events";
 import { calibrationOutcome, sentences } from "./words";
 
 interface Answer {
@@ -59,7 +59,7 @@ export function calibrations(main: HTMLElement): () => void {
   const begin = (kind: string, body: unknown) =>
     guarded(async () => {
       const run = await post<Run>(`/v1/calibrations/${kind}`, body);
-      take(await get<Run>(run.href));
+      take(await current<Run>(run.href));
     });
   const measured = () => (angle.value ? { angle_deg: Number(angle.value) } : {});
 
@@ -86,7 +86,7 @@ export function calibrations(main: HTMLElement): () => void {
       const known = runs.get(data.id);
       if (known && data.live) take({ ...known, live: data.live });
     } else if (kind === "calibration" && data.id) {
-      get<Run>(`/v1/calibrations/${data.id}`).then(take).catch(say);
+      current<Run>(`/v1/calibrations/${data.id}`).then(take).catch(say);
     } else if (kind === "gap") {
       load().catch(say);
     }

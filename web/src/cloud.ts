@@ -39,6 +39,9 @@ const PLAIN: [number, number, number] = [190, 190, 190];
 /** How long the cloud must be left alone before all of it is drawn, in milliseconds. */
 const REST_MS = 180;
 
+/** How long a cloud that nobody has touched turns by itself, in milliseconds. */
+const TURN_MS = 20_000;
+
 /** Points that are added to a resting picture at once. */
 const STRIDE = 150_000;
 
@@ -91,6 +94,7 @@ export class CloudView {
   private dirty = true;
   private marked = false;
   private turning = !matchMedia("(prefers-reduced-motion: reduce)").matches;
+  private readonly begun = performance.now();
   private alive = true;
   private pointSize = 2;
   private readonly resized: ResizeObserver;
@@ -119,7 +123,7 @@ export class CloudView {
     this.resized.observe(canvas.parentElement ?? canvas);
     this.figures.points = cloud.count;
     this.resize();
-    this.reset();
+    this.front();
     const loop = (now: number) => {
       if (!this.alive) return;
       this.step(now);
@@ -170,8 +174,13 @@ export class CloudView {
     this.touched();
   }
 
-  /** Looks from where the camera stood, a little from the side. */
+  /** Looks from where the camera stood, a little from the side, and stays there. */
   reset(): void {
+    this.turning = false;
+    this.front();
+  }
+
+  private front(): void {
     const away = (this.radius / Math.sin((this.camera.fov * Math.PI) / 360)) * 1.05;
     this.controls.target.set(0, 0, 0);
     this.camera.position.set(away * 0.35, away * 0.2, away * 0.9);
@@ -259,6 +268,7 @@ export class CloudView {
   }
 
   private step(now: number): void {
+    if (this.turning && now - this.begun > TURN_MS) this.turning = false;
     if (this.turning) {
       const offset = this.camera.position.clone().sub(this.controls.target);
       offset.applyAxisAngle(new Vector3(0, 1, 0), 0.004);

@@ -1,9 +1,9 @@
 /** The page's one stream of events: everything that changes comes by it. */
 
-import { Problem, checked, headers } from "./api";
+import { Problem, checked, get, headers } from "./api";
 import { Messages } from "./sse";
 
-export type Connection = "connecting" | "connected" | "lost";
+export type Connection = "connecting" | "connected" | "lost" | "locked";
 type Listener = (kind: string, data: any) => void;
 
 const listeners = new Set<Listener>();
@@ -33,7 +33,25 @@ export function retry(): void {
   wake();
 }
 
-function tell(kind: string, data: unknown): void {
+/** The latest revision of each scan and calibration that an event told of. */
+const revisions = new Map<string, number>();
+
+/** Whether an answer is older than what events have told already. */
+export function isStale(known: { id: string; revision: number }): boolean {
+  return known.revision < (revisions.get(known.id) ?? 0);
+}
+
+/** What is at `path`, at least as new as the events: an event may come a moment before the answer shows it. */
+export async function current<T extends { id: string; revision: number }>(path: string): Promise<T> {
+  for (let tries = 0; ; tries++) {
+    const found = await get<T>(path);
+    if (tries >= 40 || !isStale(found)) return found;
+    await new Promise((done) => setTimeout(done, 50));
+  }
+}
+
+function tell(kind: string, data: any): void {
+  if (typeof data.id === "string" && typeof data.revision === "number") revisions.set(data.id, data.revision);
   for (const listener of [...listeners]) listener(kind, data);
 }
 
@@ -66,13 +84,15 @@ async function read(last: { id: string | null }): Promise<void> {
 export async function follow(): Promise<never> {
   const last: { id: string | null } = { id: null };
   for (;;) {
+    let now: Connection = "lost";
     try {
       await read(last);
     } catch (error) {
+      if (error instanceof Problem && error.status === 401) now = "locked";
       // A number from another store; begin anew.
       if (error instanceof Problem && error.status === 422) last.id = null;
     }
-    watchers.forEach((watcher) => watcher("lost"));
+    watchers.forEach((watcher) => watcher(now));
     await new Promise<void>((done) => {
       wake = done;
       setTimeout(done, PAUSE);

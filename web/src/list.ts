@@ -2,7 +2,7 @@
 
 import { get, local, type Scan } from "./api";
 import { badge, choice, count, field, guarded, h, moment, say } from "./dom";
-import { listen } from "./events";
+import { isStale, listen } from "./events";
 import { outcome } from "./words";
 
 const LIMIT = 12;
@@ -91,6 +91,7 @@ export function scanList(): [HTMLElement, () => void] {
     const page = await get<Page>(`/v1/scans?${query}`);
     if (number !== asked) return;
     next = page.next;
+    if (page.scans.some(isStale)) refresh();
     older.disabled = next === null;
     newer.disabled = cursors.length === 1;
     const focused = document.activeElement?.getAttribute("data-scan");

@@ -86,8 +86,9 @@ watchConnection((now) => {
     return;
   }
   if (now === "lost") show("bad", "no connection, trying again");
+  if (now === "locked") show("bad", "no token");
   // Trying again and again is still no connection.
-  connection = now === "connecting" && connection === "lost" ? "lost" : now;
+  connection = now === "connecting" && connection !== "connected" ? connection : now;
 });
 listen((kind) => {
   if (kind !== "progress" && kind !== "calibration-value") refreshSoon();

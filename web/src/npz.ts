@@ -7,7 +7,7 @@ export interface Grid {
   values: Float32Array | Uint8Array;
 }
 
-const LOCAL = 0x04034b50;
+const [LOCAL, ENTRY, END] = [0x04034b50, 0x02014b50, 0x06054b50];
 
 function readNpy(bytes: Uint8Array, name: string): Grid {
   if (bytes.length < 10 || bytes[0] !== 0x93) throw new Error(`${name} is no array of numpy`);
@@ -26,21 +26,31 @@ function readNpy(bytes: Uint8Array, name: string): Grid {
   return { width, height, values: size === 4 ? new Float32Array(data.buffer) : data };
 }
 
+/** Where the directory at the archive's end begins, and how many entries it has. */
+function directory(view: DataView): { at: number; entries: number } {
+  for (let at = view.byteLength - 22; at >= 0 && at >= view.byteLength - 22 - 65535; at--) {
+    if (view.getUint32(at, true) === END) return { at: view.getUint32(at + 16, true), entries: view.getUint16(at + 10, true) };
+  }
+  throw new Error("the file of maps is no archive, or not a whole one");
+}
+
 /** All arrays of an archive by name, without `.npy`. */
 export function readNpz(data: ArrayBuffer): Map<string, Grid> {
   const grids = new Map<string, Grid>();
   const view = new DataView(data);
-  let at = 0;
-  while (at + 30 <= data.byteLength && view.getUint32(at, true) === LOCAL) {
-    const size = view.getUint32(at + 18, true);
-    const [nameLength, extraLength] = [view.getUint16(at + 26, true), view.getUint16(at + 28, true)];
-    const name = new TextDecoder().decode(new Uint8Array(data, at + 30, nameLength));
-    if (view.getUint16(at + 8, true) !== 0) throw new Error(`${name} is compressed`);
-    const start = at + 30 + nameLength + extraLength;
+  // The directory alone tells lengths for sure: a writer that streams leaves them out of what stands before a file.
+  let { at, entries } = directory(view);
+  for (; entries > 0; entries--) {
+    if (at + 46 > view.byteLength || view.getUint32(at, true) !== ENTRY) throw new Error("the directory of the maps is damaged");
+    const lengths = [28, 30, 32].map((offset) => view.getUint16(at + offset, true));
+    const name = new TextDecoder().decode(new Uint8Array(data, at + 46, lengths[0]));
+    const [size, local] = [view.getUint32(at + 20, true), view.getUint32(at + 42, true)];
+    if (view.getUint16(at + 10, true) !== 0) throw new Error(`${name} is compressed`);
+    if (local + 30 > view.byteLength || view.getUint32(local, true) !== LOCAL) throw new Error(`${name} is not where the directory says`);
+    const start = local + 30 + view.getUint16(local + 26, true) + view.getUint16(local + 28, true);
     if (start + size > data.byteLength) throw new Error(`the archive of maps ends within ${name}`);
     grids.set(name.replace(/\.npy$/, ""), readNpy(new Uint8Array(data, start, size), name));
-    at = start + size;
+    at += 46 + lengths[0] + lengths[1] + lengths[2];
   }
-  if (grids.size === 0) throw new Error("the file of maps is no archive");
   return grids;
 }

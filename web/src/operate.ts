@@ -2,7 +2,7 @@
 
 import { get, post, type Scan, type Status } from "./api";
 import { choice, field, guarded, h } from "./dom";
-import { listen } from "./events";
+import { current as latest, listen } from "./events";
 import { scanList } from "./list";
 import { preview } from "./preview";
 import { isOver, outcome } from "./words";
@@ -72,7 +72,7 @@ export function operate(main: HTMLElement): () => void {
       mine = asked.id;
       show(asked);
       // A fast scan may be over before its number is known here.
-      settle(await get<Scan>(`/v1/scans/${mine}`));
+      settle(await latest<Scan>(`/v1/scans/${mine}`));
     })();
   });
   cancel.addEventListener("click", guarded(async () => {
@@ -84,7 +84,7 @@ export function operate(main: HTMLElement): () => void {
     if (known.id !== mine || !isOver(known)) return;
     mine = null;
     show(known);
-    if (known.bytes !== null) location.hash = `#/scans/${known.id}`;
+    if (known.state === "done" || known.state === "failed") location.hash = `#/scans/${known.id}`;
   }
 
   const whenStatus = (event: Event) => {

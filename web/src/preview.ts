@@ -1,9 +1,8 @@
 /** What the camera sees now. */
 
-import { file } from "./api";
+import { file, put, type Status } from "./api";
 import { choice, field, guarded, h, say } from "./dom";
 import { histogram } from "./histogram";
-import { put } from "./api";
 
 const BINS = 64;
 const PAUSE_MS = 150;
@@ -15,6 +14,7 @@ const LIGHT: Record<string, [string, string]> = {
 };
 
 const PICTURES: [string, string][] = [
+  ["", "nothing"],
   ["black", "black"],
   ["white", "white"],
   ["h", "H, the brightest"],
@@ -49,12 +49,18 @@ export function preview(): [HTMLElement, () => void] {
   const toggle = h("button", { type: "button", "aria-pressed": "true" }, "Pause");
   const show = choice("picture", PICTURES);
   const scratch = document.createElement("canvas");
-  show.addEventListener("change", guarded(() => put("/v1/projector", { show: show.value })));
+  show.addEventListener("change", guarded(() => put("/v1/projector", { show: show.value || "black" })));
+  const whenStatus = (event: Event) => {
+    if (document.activeElement !== show) show.value = (event as CustomEvent<Status>).detail.showing ?? "";
+  };
+  document.addEventListener("status", whenStatus);
 
   async function frame(): Promise<void> {
     const answer = await file("/v1/preview.jpg");
     const share = Number(answer.headers.get("X-Polscan-Saturated-Share") ?? 0);
     const [kind, text] = LIGHT[answer.headers.get("X-Polscan-Exposure") ?? ""] ?? ["plain", ""];
+    // A dark picture says nothing of the light while nothing is shown.
+    const dark = kind === "warn" && ["", "black"].includes(show.value);
     const address = URL.createObjectURL(await answer.blob());
     const before = image.src;
     image.src = address;
@@ -62,8 +68,8 @@ export function preview(): [HTMLElement, () => void] {
     if (before) URL.revokeObjectURL(before);
     image.hidden = false;
     none.hidden = true;
-    light.className = `light ${kind}`;
-    light.textContent = share > 0 ? `${text} (${(100 * share).toFixed(2)} % saturated, red)` : text;
+    light.className = dark ? "light" : `light ${kind}`;
+    light.textContent = dark ? "The projector is dark: let it hold white to judge the light." : share > 0 ? `${text} (${(100 * share).toFixed(2)} % saturated, red)` : text;
     scratch.width = Math.min(320, image.naturalWidth);
     scratch.height = Math.max(1, Math.round((scratch.width * image.naturalHeight) / image.naturalWidth));
     const context = scratch.getContext("2d", { willReadFrequently: true });
@@ -99,5 +105,11 @@ export function preview(): [HTMLElement, () => void] {
     h("div", { class: "picture" }, image, none),
     h("div", { class: "row" }, bars, light),
   );
-  return [box, () => (running = false)];
+  return [
+    box,
+    () => {
+      running = false;
+      document.removeEventListener("status", whenStatus);
+    },
+  ];
 }

@@ -3,7 +3,7 @@
 import { file, get, local, patch, post, remove, type Report, type Scan } from "./api";
 import { cloudPanel } from "./cloud_panel";
 import { badge, count, guarded, h, moment, say, size } from "./dom";
-import { listen } from "./events";
+import { current, listen } from "./events";
 import { mapsPanel } from "./maps";
 import { causes, coverage, isOver, meaning, outcome, sentences, title } from "./words";
 
@@ -32,22 +32,27 @@ async function reportPanel(scan: Scan, report: Report | null): Promise<HTMLEleme
   box.append(h("p", { class: "verdict" }, badge(tone, word), " ", meaning(scan)));
   const found = causes(scan, report);
   for (const cause of found) {
-    box.append(h("article", { class: "cause" }, h("h3", {}, title(cause.type)), h("p", {}, sentences(cause.message))));
+    const numbers = Object.keys(cause.evidence ?? {}).length
+      ? h("details", {}, h("summary", {}, "The numbers behind it"), h("pre", { tabindex: 0 }, JSON.stringify(cause.evidence, null, 1)))
+      : null;
+    box.append(h("article", { class: "cause" }, h("h3", {}, title(cause.type)), h("p", {}, sentences(cause.message)), numbers));
   }
   const evidence = has("maps/worst-pair.png") ?? (found.length ? has("maps/residual.png") : undefined);
   if (evidence && found.length) {
     box.append(await picture(evidence.href, "Residual at each pixel", "The evidence: what does not add up at each pixel, in units of the camera's noise. White or strong colours are where to look."));
   }
-  if (report) {
+  if (report?.pixels) {
     const share = coverage(report);
     const rows: [string, string][] = [
-      ["Points", count(report.points)],
+      ["Points", count(report.points ?? 0)],
       ["Measured", share === null ? "nothing was lit" : `${share.toFixed(1)} % of the lit pixels`],
     ];
     for (const plane of report.planes ?? []) {
       if (plane.rmse_mm !== null) rows.push([`Flatness, ${plane.name}`, `${plane.rmse_mm.toFixed(3)} mm RMS`]);
     }
     box.append(h("dl", {}, ...rows.flatMap(([name, value]) => [h("dt", {}, name), h("dd", {}, value)])));
+  }
+  if (report) {
     for (const note of report.notes) box.append(h("p", { class: "small" }, sentences(note)));
   }
   const summary = has("report.json") ? await (await file(`${scan.href}/summary.txt`)).text() : "";
@@ -104,6 +109,7 @@ function editPanel(scan: Scan): HTMLElement {
 export function scanView(main: HTMLElement, id: string): () => void {
   let ended = false;
   let shown = false;
+  let revision = -1;
   let dispose: () => void = () => undefined;
   const heading = h("h1", {}, "Scan");
   const body = h("div", { class: "scan-view" }, h("p", {}, "Loading."));
@@ -128,20 +134,22 @@ export function scanView(main: HTMLElement, id: string): () => void {
     if (maps) {
       const holder = h("section", { class: "panel", "aria-labelledby": "maps-title" }, h("h2", { id: "maps-title" }, "Maps"));
       wide.append(holder);
-      holder.append(await mapsPanel(maps.href));
+      // A report is worth reading where the maps are damaged as well.
+      holder.append(await mapsPanel(maps.href).catch((error) => h("p", { class: "none" }, sentences(`the maps cannot be shown: ${error.message}`))));
     }
   }
 
   async function load(): Promise<void> {
-    const scan = await get<Scan>(`/v1/scans/${id}`);
-    if (ended) return;
+    const scan = await current<Scan>(`/v1/scans/${id}`);
+    // Answers may overtake each other.
+    if (ended || shown || scan.revision < revision) return;
+    revision = scan.revision;
     heading.textContent = scan.label ?? moment(scan.created);
     document.title = `${heading.textContent}: polscan`;
     if (!isOver(scan)) {
       body.replaceChildren(h("p", { role: "status" }, `This scan is ${outcome(scan)[1]}: ${scan.progress.frames} of ${scan.progress.of || "?"} patterns.`));
       return;
     }
-    if (shown) return;
     shown = true;
     await fill(scan);
   }

@@ -27,6 +27,7 @@ export const isOver = (scan: Pick<Scan, "state">): boolean =>
 
 /** State or verdict of a scan, in a word. */
 export function outcome(scan: Scan): [Tone, string] {
+  if (scan.state === "cancelled" || scan.state === "interrupted") return ["plain", STATES[scan.state]];
   if (scan.verdict) return VERDICTS[scan.verdict] ?? ["plain", scan.verdict];
   if (scan.state === "failed") return VERDICTS.failed;
   if (scan.held) return ["plain", "held"];
@@ -48,7 +49,7 @@ export function sentences(message: string): string {
 
 /** What the verdict means for the one who wants to use the result. */
 export function meaning(scan: Scan): string {
-  switch (scan.verdict ?? scan.state) {
+  switch (scan.state === "cancelled" || scan.state === "interrupted" ? scan.state : (scan.verdict ?? scan.state)) {
     case "ok":
       return "Nothing speaks against the result.";
     case "degraded":
@@ -73,6 +74,7 @@ export function causes(scan: Scan, report: Report | null): Cause[] {
 
 /** Share of the lit pixels that were measured, in percent; `null` where nothing was lit. */
 export function coverage(report: Report): number | null {
+  if (!report.pixels) return null;
   const { lit, valid } = report.pixels;
   return lit > 0 ? (100 * valid) / lit : null;
 }

@@ -17,17 +17,17 @@ test("a lost connection is said, and found again without reloading", async ({ pa
 
 test("a service with tokens asks for one, refuses a wrong one and keeps the right one", async ({ page, daemon }) => {
   await daemon.kill();
-  const token = daemon.addToken("operate");
+  const token = daemon.addToken("scan");
   await daemon.start();
   await page.goto(daemon.url);
   const dialog = page.getByRole("dialog", { name: "This scanner asks for a token" });
   await expect(dialog).toBeVisible();
   await accessible(page);
   await shot(page, "login");
-  await page.getByLabel("Token").fill("wrong");
+  await page.locator("#token").fill("wrong");
   await page.keyboard.press("Enter");
   await expect(dialog).toContainText("not known");
-  await page.getByLabel("Token").fill(token);
+  await page.locator("#token").fill(token);
   await page.keyboard.press("Enter");
   await expect(dialog).toBeHidden();
   await expect(page.locator("#state")).toHaveText("ready to scan");

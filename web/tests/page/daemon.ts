@@ -20,7 +20,6 @@ export class Daemon {
   readonly folder = mkdtempSync(join(tmpdir(), "polscan-page-"));
   private process: ChildProcess | null = null;
   private address = "127.0.0.1:0";
-  private more: string[] = [];
 
   constructor(rig: Rig = {}) {
     execFileSync(PYTHON, [join(ROOT, "tests/python/small_twin.py"), this.folder, "4", ...(rig.set ?? [])]);
@@ -35,7 +34,7 @@ export class Daemon {
   addToken(scope: string): string {
     const file = join(this.folder, "tokens.toml");
     const secret = execFileSync(BINARY, ["token", "add", scope, "--scope", scope, "--file", file], { encoding: "utf8" });
-    this.more = ["--tokens", file];
+    appendFileSync(join(this.folder, "polscan.toml"), `\n[api]\ntokens = ${JSON.stringify(file)}\n`);
     return secret.trim().split("\n")[0].trim();
   }
 
@@ -44,7 +43,7 @@ export class Daemon {
     const told = join(this.folder, "address");
     rmSync(told, { force: true });
     const options = ["--config", "polscan.toml", "--listen", this.address, "--address-file", told];
-    const child = spawn(BINARY, ["serve", ...options, ...this.more], { cwd: this.folder, stdio: ["ignore", "ignore", "pipe"] });
+    const child = spawn(BINARY, ["serve", ...options], { cwd: this.folder, stdio: ["ignore", "ignore", "pipe"] });
     let log = "";
     child.stderr?.on("data", (text) => (log += text));
     this.process = child;

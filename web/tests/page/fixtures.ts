@@ -2,10 +2,22 @@
 
 import AxeBuilder from "@axe-core/playwright";
 import { test as base, expect, type Page } from "@playwright/test";
+import { readFileSync } from "node:fs";
 import { join, resolve } from "node:path";
 import { Daemon, type Rig } from "./daemon";
 
 const SHOTS = resolve(import.meta.dirname, "../../../target/page/screenshots");
+
+/** The page as built last, where somebody works on it and does not want to build the program each time. */
+async function fromDisk(page: Page): Promise<void> {
+  const folder = resolve(import.meta.dirname, "../../dist");
+  await page.route(/:\d+\/(assets\/(page|cloud)\.\w+)?$/, async (route) => {
+    const response = await route.fetch();
+    const path = new URL(route.request().url()).pathname;
+    const { "content-encoding": _, "content-length": __, ...headers } = response.headers();
+    await route.fulfill({ response, headers, body: readFileSync(join(folder, path === "/" ? "index.html" : path)) });
+  });
+}
 
 interface Fixtures {
   rig: Rig;
@@ -23,6 +35,7 @@ export const test = base.extend<Fixtures>({
   },
   watched: [
     async ({ page, daemon }, use) => {
+      if (process.env.POLSCAN_PAGE_FROM_DISK) await fromDisk(page);
       const watched = { hosts: new Set<string>(), errors: [] as string[] };
       page.on("request", (request) => {
         const address = new URL(request.url());

@@ -70,26 +70,44 @@ function npy(kind: string, shape: string, data: Buffer): Buffer {
   return Buffer.concat([Buffer.from([0x93, ...Buffer.from("NUMPY"), 1, 0, text.length & 255, text.length >> 8]), Buffer.from(text), data]);
 }
 
-function stored(name: string, data: Buffer): Buffer {
-  const head = Buffer.alloc(30);
-  head.writeUInt32LE(0x04034b50, 0);
-  head.writeUInt32LE(data.length, 18);
-  head.writeUInt32LE(data.length, 22);
-  head.writeUInt16LE(name.length, 26);
-  return Buffer.concat([head, Buffer.from(name), data]);
+/** An archive as a writer that streams makes it: lengths stand in the directory alone. */
+function archived(files: [string, Buffer][], method = 0): Buffer {
+  const [parts, entries]: Buffer[][] = [[], []];
+  let at = 0;
+  for (const [name, data] of files) {
+    const head = Buffer.alloc(30);
+    head.writeUInt32LE(0x04034b50, 0);
+    head.writeUInt16LE(name.length, 26);
+    const entry = Buffer.alloc(46);
+    entry.writeUInt32LE(0x02014b50, 0);
+    entry.writeUInt16LE(method, 10);
+    entry.writeUInt32LE(data.length, 20);
+    entry.writeUInt16LE(name.length, 28);
+    entry.writeUInt32LE(at, 42);
+    parts.push(head, Buffer.from(name), data);
+    entries.push(entry, Buffer.from(name));
+    at += 30 + name.length + data.length;
+  }
+  const end = Buffer.alloc(22);
+  end.writeUInt32LE(0x06054b50, 0);
+  end.writeUInt16LE(files.length, 10);
+  end.writeUInt32LE(at, 16);
+  return Buffer.concat([...parts, ...entries, end]);
 }
 
 test("maps are read from an archive, and damage is named", () => {
   const floats = Buffer.from(new Float32Array([1.5, NaN, -2, 4, 5, 6]).buffer);
-  const archive = Buffer.concat([stored("depth.npy", npy("<f4", "(2, 3)", floats)), stored("class.npy", npy("|u1", "(1, 2)", Buffer.from([7, 9])))]);
+  const files: [string, Buffer][] = [["depth.npy", npy("<f4", "(2, 3)", floats)], ["class.npy", npy("|u1", "(1, 2)", Buffer.from([7, 9]))]];
+  const archive = archived(files);
   const grids = readNpz(buffer(archive));
   expect([...grids.keys()]).toEqual(["depth", "class"]);
   expect([grids.get("depth")?.width, grids.get("depth")?.height]).toEqual([3, 2]);
   expect([...(grids.get("depth")?.values ?? [])]).toEqual([1.5, NaN, -2, 4, 5, 6]);
   expect([...(grids.get("class")?.values ?? [])]).toEqual([7, 9]);
-  expect(() => readNpz(buffer(archive.subarray(0, 90)))).toThrow("ends within");
+  expect(() => readNpz(buffer(archive.subarray(0, -1)))).toThrow("not a whole one");
+  expect(() => readNpz(buffer(archived(files, 8)))).toThrow("depth.npy is compressed");
   expect(() => readNpz(buffer(Buffer.from("no archive at all, surely not")))).toThrow("no archive");
-  expect(() => readNpz(buffer(stored("a.npy", npy("<f8", "(1, 1)", Buffer.alloc(8)))))).toThrow("unknown kind <f8");
+  expect(() => readNpz(buffer(archived([["a.npy", npy("<f8", "(1, 1)", Buffer.alloc(8))]])))).toThrow("unknown kind <f8");
 });
 
 test("a section takes what lies between its ends and within its thickness", () => {
