@@ -1,5 +1,5 @@
 # Two commands are all that is needed: `make run` and `make test`. Both install what is missing first.
-.PHONY: run serve test captures foreign-plane python closed-loop faults soak kills service-figures fuzz accuracy api-fuzz systemd v4l2 deb setup install ci
+.PHONY: run serve test captures foreign-plane python page-test closed-loop faults soak kills service-figures fuzz accuracy api-fuzz systemd v4l2 deb setup install ci
 
 run: ## build, serve the simulated rig, scan it over REST, say where the results are
 	@scripts/install build
@@ -12,6 +12,13 @@ serve: ## build and serve until Ctrl-C; CONFIG names another configuration than 
 test: ## every test that needs no device
 	@scripts/install test
 	@scripts/test
+
+page: ## build the operator's page into web/dist
+	@scripts/install build
+
+page-test: ## the operator's page in Chromium against the service, about 3 minutes; pictures in target/page/screenshots
+	@scripts/install test
+	@scripts/page-test
 
 captures: ## decode real captures made by others (POLSCAN_CAPTURES names their folder)
 	@scripts/install build

@@ -92,6 +92,7 @@ export class CloudView {
   private moved = 0;
   private last = 0;
   private dirty = true;
+  private moving = false;
   private marked = false;
   private turning = !matchMedia("(prefers-reduced-motion: reduce)").matches;
   private readonly begun = performance.now();
@@ -181,7 +182,7 @@ export class CloudView {
   }
 
   private front(): void {
-    const away = (this.radius / Math.sin((this.camera.fov * Math.PI) / 360)) * 1.05;
+    const away = (this.radius / Math.sin((this.camera.fov * Math.PI) / 360)) * 0.8;
     this.controls.target.set(0, 0, 0);
     this.camera.position.set(away * 0.35, away * 0.2, away * 0.9);
     this.camera.near = away / 100;
@@ -277,19 +278,21 @@ export class CloudView {
       this.touched();
     }
     if (this.dirty) {
-      // The way from picture to picture is what the operator sees, however the driver counts.
+      // The way from picture to picture is what the operator sees, however the driver counts; pictures that only
+      // complete a resting cloud are not meant.
       const took = now - this.last;
-      if (this.shown > 0 && took < 1000) {
+      if (this.moving) {
         this.drawn = budget(Math.min(this.drawn, this.cloud.count), took, this.cloud.count);
         this.figures.frame_ms = took;
       }
-      this.last = now;
+      this.moving = true;
       this.dirty = false;
       this.shown = Math.min(this.drawn, this.cloud.count);
       this.material.size = this.pointSize * growth(this.shown, this.cloud.count) * Math.min(devicePixelRatio, 2);
       this.renderer.clear();
       this.draw(0, this.shown, true);
     } else if (this.shown < this.cloud.count && now - this.moved > REST_MS) {
+      this.moving = false;
       const first = this.shown === this.drawn ? 0 : this.shown;
       this.material.size = this.pointSize * Math.min(devicePixelRatio, 2);
       if (first === 0) this.renderer.clear();
@@ -297,8 +300,9 @@ export class CloudView {
       this.shown = first + more;
       this.draw(first, more, this.shown === this.cloud.count);
     } else {
-      this.last = now;
+      this.moving = false;
     }
+    this.last = now;
     this.figures.drawn = this.shown;
     this.canvas.dataset.drawn = String(this.shown);
     this.canvas.dataset.frameMs = this.figures.frame_ms.toFixed(0);

@@ -1,6 +1,6 @@
 /** What the camera sees now. */
 
-import { file, put, type Status } from "./api";
+import { Problem, file, put, type Status } from "./api";
 import { choice, field, guarded, h, say } from "./dom";
 import { histogram } from "./histogram";
 
@@ -50,7 +50,9 @@ export function preview(): [HTMLElement, () => void] {
   const show = choice("picture", PICTURES);
   const scratch = document.createElement("canvas");
   show.addEventListener("change", guarded(() => put("/v1/projector", { show: show.value || "black" })));
+  let busy = false;
   const whenStatus = (event: Event) => {
+    busy = (event as CustomEvent<Status>).detail.state !== "idle";
     if (document.activeElement !== show) show.value = (event as CustomEvent<Status>).detail.showing ?? "";
   };
   document.addEventListener("status", whenStatus);
@@ -68,8 +70,14 @@ export function preview(): [HTMLElement, () => void] {
     if (before) URL.revokeObjectURL(before);
     image.hidden = false;
     none.hidden = true;
-    light.className = dark ? "light" : `light ${kind}`;
-    light.textContent = dark ? "The projector is dark: let it hold white to judge the light." : share > 0 ? `${text} (${(100 * share).toFixed(2)} % saturated, red)` : text;
+    // While a scan runs, each picture is a pattern; they say nothing of the light one by one.
+    if (busy) {
+      light.className = "light";
+      light.textContent = "";
+    } else {
+      light.className = dark ? "light" : `light ${kind}`;
+      light.textContent = dark ? "The projector is dark: let it hold white to judge the light." : share > 0 ? `${text} (${(100 * share).toFixed(2)} % saturated, red)` : text;
+    }
     scratch.width = Math.min(320, image.naturalWidth);
     scratch.height = Math.max(1, Math.round((scratch.width * image.naturalHeight) / image.naturalWidth));
     const context = scratch.getContext("2d", { willReadFrequently: true });
@@ -85,7 +93,8 @@ export function preview(): [HTMLElement, () => void] {
       if (!document.hidden && toggle.getAttribute("aria-pressed") === "true") {
         await frame().catch((error) => {
           none.hidden = false;
-          none.textContent = error instanceof Error ? error.message : String(error);
+          none.textContent =
+            error instanceof Problem && error.status === 401 ? "Waiting for a token." : error instanceof Error ? error.message : String(error);
         });
       }
       await new Promise((done) => setTimeout(done, PAUSE_MS));

@@ -39,7 +39,7 @@ async function reportPanel(scan: Scan, report: Report | null): Promise<HTMLEleme
   }
   const evidence = has("maps/worst-pair.png") ?? (found.length ? has("maps/residual.png") : undefined);
   if (evidence && found.length) {
-    box.append(await picture(evidence.href, "Residual at each pixel", "The evidence: what does not add up at each pixel, in units of the camera's noise. White or strong colours are where to look."));
+    box.append(await picture(evidence.href, "Residual at each pixel", "The evidence: what does not add up at each pixel, in units of the camera's noise. Yellow is where to look."));
   }
   if (report?.pixels) {
     const share = coverage(report);
