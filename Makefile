@@ -1,5 +1,5 @@
 # Two commands are all that is needed: `make run` and `make test`. Both install what is missing first.
-.PHONY: run serve test captures foreign-plane python page-test closed-loop faults soak kills service-figures fuzz accuracy api-fuzz systemd v4l2 deb setup install ci
+.PHONY: run serve test captures foreign-plane python page page-test closed-loop faults soak kills service-figures fuzz accuracy api-fuzz systemd v4l2 deb setup install ci
 
 run: ## build, serve the simulated rig, scan it over REST, say where the results are
 	@scripts/install build
