@@ -10,6 +10,8 @@ const BINARY = process.env.POLSCAN_BINARY ?? join(ROOT, "target/debug/polscan");
 const PYTHON = process.env.POLSCAN_PYTHON ?? join(ROOT, ".cache/python/bin/python");
 
 export interface Rig {
+  /** What the paper's rig is divided by. */
+  scale?: number;
   /** Keys of the configuration, `table.key=value`. */
   set?: string[];
   /** Entries of `[[sim.faults]]`. */
@@ -22,7 +24,7 @@ export class Daemon {
   private address = "127.0.0.1:0";
 
   constructor(rig: Rig = {}) {
-    execFileSync(PYTHON, [join(ROOT, "tests/python/small_twin.py"), this.folder, "4", ...(rig.set ?? [])]);
+    execFileSync(PYTHON, [join(ROOT, "tests/python/small_twin.py"), this.folder, String(rig.scale ?? 4), ...(rig.set ?? [])]);
     if (rig.fault) appendFileSync(join(this.folder, "polscan.toml"), `\n[[sim.faults]]\n${rig.fault}\n`);
   }
 
