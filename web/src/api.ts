@@ -70,7 +70,7 @@ export interface Run {
   id: string;
   revision: number;
   kind: string;
-  state: "running" | "done" | "failed" | "cancelled" | "interrupted";
+  state: "open" | "running" | "done" | "failed" | "cancelled" | "interrupted";
   created: string;
   steps: number;
   doing: string | null;

@@ -102,8 +102,8 @@ export function calibrations(main: HTMLElement): () => void {
       h(
         "div",
         { class: "fields" },
-        h("button", { type: "button", class: "primary", onclick: begin("noise", {}) }, "Noise of the camera"),
-        h("button", { type: "button", class: "primary", onclick: begin("sync", {}) }, "Timing of the projector"),
+        h("button", { type: "button", class: "primary", onclick: begin("noise", {}) }, "Camera noise"),
+        h("button", { type: "button", class: "primary", onclick: begin("sync", {}) }, "Projector timing"),
         h("button", { type: "button", class: "primary", onclick: begin("polarization", { watch_s: 600 }) }, "Turn the polarizer"),
         h("button", { type: "button", class: "primary", onclick: () => begin("polarization", measured())() }, "Polarization"),
         field("Polarizer reads (°)", angle),

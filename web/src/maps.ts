@@ -51,13 +51,22 @@ function paint(canvas: HTMLCanvasElement, name: string, grid: Grid): [number, nu
   return name === "class" ? null : [low, high];
 }
 
+/** Signs of the classes that a map has. */
+function classSigns(grid: Grid): HTMLElement[] {
+  return [...new Set(grid.values)].sort((a, b) => a - b).map((value) => {
+    const sign = h("span", { class: "sign" });
+    sign.style.background = `rgb(${(COLOURS[value] ?? [0, 0, 0]).join(",")})`;
+    return h("span", { class: "entry" }, sign, CLASSES[value] ?? String(value));
+  });
+}
+
 /** Maps of the archive at `href`. */
 export async function mapsPanel(href: string): Promise<HTMLElement> {
   const grids = readNpz(await bytes(href));
   const names = Object.keys(NAMES).filter((name) => grids.has(name));
   const canvas = h("canvas", { class: "map", tabindex: 0, role: "img", "aria-describedby": "map-value" });
   const value = h("p", { id: "map-value", class: "value", "aria-live": "polite" }, "Point at the map, or move the cursor with the arrow keys.");
-  const scale = h("p", { class: "small" });
+  const scale = h("p", { class: "small legend" });
   const which = choice("map", names.map((name) => [name, NAMES[name][0]]), () => show());
   let [x, y] = [0, 0];
   const tell = () => {
@@ -69,7 +78,9 @@ export async function mapsPanel(href: string): Promise<HTMLElement> {
     const range = paint(canvas, which.value, grid);
     canvas.setAttribute("aria-label", `Map of ${NAMES[which.value][0]}`);
     const unit = NAMES[which.value][1];
-    scale.textContent = range ? `blue ${range[0].toPrecision(4)} ${unit}, yellow ${range[1].toPrecision(4)} ${unit}` : "";
+    scale.replaceChildren();
+    if (range) scale.textContent = `blue ${range[0].toPrecision(4)} ${unit}, yellow ${range[1].toPrecision(4)} ${unit}`;
+    else scale.append(...classSigns(grid));
   }
   const clamp = () => {
     x = Math.min(Math.max(x, 0), canvas.width - 1);

@@ -3,7 +3,7 @@ import { accessible, expect, shot, test } from "./fixtures";
 test("the noise of the camera is calibrated, and the result told", async ({ page, daemon }) => {
   await page.goto(`${daemon.url}/#/calibrations`);
   await expect(page.locator("#state")).toHaveText("ready to scan");
-  await page.getByRole("button", { name: "Noise of the camera" }).click();
+  await page.getByRole("button", { name: "Camera noise" }).click();
   const run = page.locator("[data-run]");
   await expect(run.locator(".badge")).toHaveText("✓ accepted", { timeout: 40_000 });
   const [told] = (await daemon.get("/v1/calibrations")).runs;
