@@ -248,7 +248,8 @@ impl Predicate for Compressible {
         let headers = response.headers();
         let kind =
             headers.get(header::CONTENT_TYPE).and_then(|value| value.to_str().ok()).unwrap_or_default();
-        let text = ["application/json", "text/html", "text/css", "application/openmetrics-text", "text/javascript"];
+        let text =
+            ["application/json", "text/html", "text/css", "application/openmetrics-text", "text/javascript"];
         let long = response.body().size_hint().exact().is_none_or(|bytes| bytes > 1024);
         long && response.status() != StatusCode::PARTIAL_CONTENT
             && !headers.contains_key(header::ACCEPT_RANGES)
