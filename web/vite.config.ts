@@ -1,7 +1,12 @@
+import { readFileSync } from "node:fs";
 import { defineConfig } from "vite";
+
+// What is passed on with the program keeps its licence.
+const licence = readFileSync(new URL("node_modules/three/LICENSE", import.meta.url), "utf8");
 
 // Names are fixed, since the program embeds these files by name; the service has browsers ask whether they changed.
 export default defineConfig({
+  esbuild: { legalComments: "inline" },
   build: {
     target: "es2022",
     assetsInlineLimit: 0,
@@ -10,6 +15,7 @@ export default defineConfig({
     chunkSizeWarningLimit: 1000,
     rollupOptions: {
       output: {
+        banner: (chunk) => (chunk.name === "cloud" ? `/*! three.js\n${licence}*/` : ""),
         entryFileNames: "assets/page.js",
         chunkFileNames: "assets/[name].js",
         assetFileNames: "assets/page[extname]",

@@ -206,6 +206,7 @@ test("the script is less than 1 MB, compressed", () => {
   const scripts = readdirSync(folder).filter((name) => name.endsWith(".js"));
   expect(scripts.sort()).toEqual(["cloud.js", "page.js"]);
   const bytes = scripts.reduce((sum, name) => sum + gzipSync(readFileSync(join(folder, name))).length, 0);
+  expect(readFileSync(join(folder, "cloud.js"), "utf8"), "what is passed on keeps its licence").toContain("three.js authors");
   console.log(`${bytes} bytes of script, compressed`);
   expect(bytes).toBeLessThan(1_000_000);
 });
