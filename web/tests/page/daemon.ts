@@ -2,6 +2,7 @@
 
 import { type ChildProcess, execFileSync, spawn } from "node:child_process";
 import { appendFileSync, existsSync, mkdtempSync, readFileSync, rmSync } from "node:fs";
+import { request } from "node:http";
 import { tmpdir } from "node:os";
 import { join, resolve } from "node:path";
 
@@ -73,17 +74,29 @@ export class Daemon {
   }
 
   async get(path: string): Promise<any> {
-    return (await fetch(this.url + path)).json();
+    return this.ask("GET", path);
   }
 
   /** Scans and waits for the end. */
   async scan(body: object = {}): Promise<any> {
-    const answer = await fetch(`${this.url}/v1/scans?wait=done`, {
-      method: "POST",
-      headers: { "Content-Type": "application/json" },
-      body: JSON.stringify(body),
+    return this.ask("POST", "/v1/scans?wait=done", JSON.stringify(body));
+  }
+
+  /** Asks over a connection of its own: one that is kept may have been closed by the time it is used again. */
+  private ask(method: string, path: string, body?: string): Promise<any> {
+    return new Promise((done, failed) => {
+      const headers = { "Content-Type": "application/json", Connection: "close" };
+      const asked = request(this.url + path, { method, headers, agent: false }, (answer) => {
+        let text = "";
+        answer.setEncoding("utf8").on("data", (part) => (text += part));
+        answer.on("end", () => {
+          if ((answer.statusCode ?? 500) < 300) done(JSON.parse(text));
+          else failed(new Error(`${method} ${path}: ${answer.statusCode} ${text}`));
+        });
+        answer.on("error", failed);
+      });
+      asked.on("error", failed);
+      asked.end(body);
     });
-    if (!answer.ok) throw new Error(`POST /v1/scans: ${answer.status} ${await answer.text()}`);
-    return answer.json();
   }
 }

@@ -52,6 +52,8 @@ test.describe("on a tiny rig", () => {
   test.use({ rig: { scale: 8 } });
 
   test("list: thumbnails, verdicts, filter and pages", async ({ page, daemon }) => {
+    // Fourteen scans take their time on a busy machine.
+    test.slow();
     await daemon.scan({ label: "wanted", tags: ["blue"] });
     for (let index = 0; index < 13; index++) await daemon.scan({ label: `other ${index}`, mode: "fast" });
     await page.goto(daemon.url);
