@@ -1,5 +1,5 @@
 # Two commands are all that is needed: `make run` and `make test`. Both install what is missing first.
-.PHONY: run serve test captures foreign-plane python page page-test closed-loop faults soak kills service-figures fuzz accuracy api-fuzz systemd v4l2 deb setup install ci
+.PHONY: run serve test captures foreign-plane python page page-test closed-loop faults soak kills service-figures fuzz accuracy bench api-fuzz systemd v4l2 deb setup install ci
 
 run: ## build, serve the simulated rig, scan it over REST, say where the results are
 	@scripts/install build
@@ -60,6 +60,10 @@ fuzz: ## every parser with damaged input, 15 minutes each; scripts/fuzz SECONDS 
 accuracy: ## measure the scanner on the simulated rig, about 5 minutes; writes docs/accuracy.md and its plots
 	@scripts/install build
 	cargo run --locked --profile test --example accuracy
+
+bench: ## measure how fast frames are decoded, against a plain read, OpenCV and numpy; writes docs/speed.md. STAGE measures one
+	@scripts/install test
+	@scripts/bench $(STAGE)
 
 api-fuzz: ## ask a live service what its API document allows and what it does not, about 3 minutes
 	@scripts/install test

@@ -15,6 +15,8 @@ mod oracle;
 mod pair_sum;
 mod plan;
 mod sample;
+#[cfg(feature = "synthetic")]
+mod stages;
 mod subpixel;
 #[cfg(any(test, feature = "synthetic"))]
 pub mod synth;
@@ -26,6 +28,8 @@ pub use contrast::{Contrast, contrast};
 pub use edge_image::{ImageEdge, edges_of_image};
 pub use gates::BoundaryCheck;
 pub use pair_sum::{PairContext, estimate_noise, pair_residual};
+#[cfg(feature = "synthetic")]
+pub use stages::each_stage;
 pub use types::{
     AxisMap, CameraResponse, Class, DecodeError, DecodeSettings, Decoded, NoiseModel, PairResidual, Plane,
     PlaneSource, SharedPlane, Thresholds,

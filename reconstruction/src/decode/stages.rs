@@ -1,0 +1,66 @@
+//! The stages of a decode one at a time, for whoever measures them. A decode comes through the same functions in the
+//! same order.
+
+use std::hint::black_box;
+
+use polscan_patterns::Role;
+
+use super::{
+    gates,
+    limits::Gates,
+    noise, pair_sum,
+    plan::plan,
+    sample::Sample,
+    subpixel,
+    types::{DecodeError, DecodeSettings, Plane, SharedPlane},
+    words::decode_pixels,
+};
+
+/// Calls `visit` with the name of each stage and with what does the stage's work once each time that it is called.
+///
+/// # Errors
+/// As [`finish`](super::Accumulator::finish).
+pub fn each_stage(
+    settings: &DecodeSettings,
+    frames: &[(Role, SharedPlane)],
+    visit: &mut dyn FnMut(&'static str, &mut dyn FnMut()),
+) -> Result<(), DecodeError> {
+    match frames.first().map(|(_, plane)| plane.plane()) {
+        Some(Plane::U16(_)) => typed::<u16>(settings, frames, visit),
+        _ => typed::<u8>(settings, frames, visit),
+    }
+}
+
+fn typed<T: Sample>(
+    settings: &DecodeSettings,
+    pushed: &[(Role, SharedPlane)],
+    visit: &mut dyn FnMut(&'static str, &mut dyn FnMut()),
+) -> Result<(), DecodeError> {
+    let frames = plan::<T>(settings, pushed)?;
+    let camera = settings.camera;
+    let black_level_dn = camera.black_level_dn.unwrap_or(0.0);
+    visit("noise", &mut || {
+        black_box(noise::estimate(&frames, camera.bit_depth, black_level_dn, camera.saturation_dn));
+    });
+    let gates = Gates::new(settings, camera.noise.unwrap_or_else(|| noise::assumed(camera.bit_depth)));
+    visit("words", &mut || {
+        black_box(decode_pixels(&frames, &gates));
+    });
+    let mut maps = decode_pixels(&frames, &gates);
+    visit("pair-sums", &mut || {
+        black_box(pair_sum::of_scan(&frames, &maps, &gates));
+    });
+    let before = maps.class.clone();
+    visit("gates", &mut || {
+        maps.class.clone_from(&before);
+        black_box(gates::apply(&frames, &mut maps, &settings.thresholds));
+    });
+    maps.class = before;
+    let (_, shapes) = gates::apply(&frames, &mut maps, &settings.thresholds);
+    for (index, shape) in shapes.iter().enumerate() {
+        visit(if index == 0 { "subpixel-first-axis" } else { "subpixel-second-axis" }, &mut || {
+            black_box(subpixel::refine(&frames, &maps, &gates, &settings.thresholds, index, *shape));
+        });
+    }
+    Ok(())
+}
