@@ -70,28 +70,39 @@ fn typed<T: Sample>(
     let scale = 255.0 / ((1u32 << bit_depth) - 1) as f32;
     let black = black_level_dn as f32;
     // Grey levels of one row of one frame: raw, DOLP.
-    let grey_row = |frame: &[T], y: usize, raw: &mut [f32], dolp: &mut [f32]| {
+    let grey_row = |frame: &[T], dark_dn: &[f32], y: usize, raw: &mut [f32], dolp: &mut [f32]| {
+        let frame = &frame[y * width..][..width];
+        let (dark_dn, raw, dolp) = (&dark_dn[..width], &mut raw[..width], &mut dolp[..width]);
         for x in 0..width {
-            let at = y * width + x;
-            let dn = frame[at].dn() as f32;
-            let dark_dn = dark.iter().map(|plane| plane[at].dn()).sum::<i32>() as f32 / dark.len() as f32;
+            let (dn, dark_dn) = (frame[x].dn() as f32, dark_dn[x]);
             let sum = dn + dark_dn - 2.0 * black;
             let degree = if sum > 0.0 { (dn - dark_dn) / sum } else { 0.0 };
             raw[x] = dn * scale;
             dolp[x] = degree.clamp(0.0, 1.0) * 255.0;
         }
     };
+    // The mean dark level of a row, the same for all frames.
+    let dark_row = |y: usize, mean: &mut [f32]| {
+        for (x, mean) in mean.iter_mut().enumerate() {
+            let at = y * width + x;
+            *mean = dark.iter().map(|plane| plane[at].dn()).sum::<i32>() as f32 / dark.len() as f32;
+        }
+    };
     let rows: Vec<Sums> = (0..height)
         .into_par_iter()
         .map_init(
-            || [0; 4].map(|_| vec![0.0f32; width]),
-            |[raw, dolp, raw_below, dolp_below], y| {
+            || [0; 6].map(|_| vec![0.0f32; width]),
+            |[raw, dolp, raw_below, dolp_below, dark, dark_below], y| {
                 let mut sums = Sums::default();
+                let has_below = y + 1 < height;
+                dark_row(y, dark);
+                if has_below {
+                    dark_row(y + 1, dark_below);
+                }
                 for frame in &code {
-                    grey_row(frame, y, raw, dolp);
-                    let has_below = y + 1 < height;
+                    grey_row(frame, dark, y, raw, dolp);
                     if has_below {
-                        grey_row(frame, y + 1, raw_below, dolp_below);
+                        grey_row(frame, dark_below, y + 1, raw_below, dolp_below);
                     }
                     let mut add = |one: (f32, f32), other: (f32, f32), both_lit: bool| {
                         let raw = f64::from((one.0 - other.0) * (one.0 - other.0));
@@ -136,4 +147,74 @@ fn typed<T: Sample>(
         dolp_lit: total.dolp_lit / lit_pairs,
         ratio_lit: total.dolp_lit / total.raw_lit,
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::decode::synth::random;
+
+    /// Grey level and DOLP of one pixel of one frame, straight from the samples.
+    fn grey(frame: &[u16], dark: &[Vec<u16>], at: usize) -> (f32, f32) {
+        let (dn, black) = (f32::from(frame[at]), 41.5f32);
+        let dark = dark.iter().map(|plane| i32::from(plane[at])).sum::<i32>() as f32 / dark.len() as f32;
+        let sum = dn + dark - 2.0 * black;
+        let degree = if sum > 0.0 { (dn - dark) / sum } else { 0.0 };
+        (dn * (255.0 / 4095.0f32), degree.clamp(0.0, 1.0) * 255.0)
+    }
+
+    #[test]
+    fn agrees_to_the_bit_with_a_direct_sum_on_one_thread_and_on_two() {
+        let (width, height) = (13, 9);
+        let frame = |seed: u64| -> Vec<u16> {
+            (0..width * height).map(|at| (random(seed << 32 | at as u64) & 0xfff) as u16).collect()
+        };
+        let (code, dark): (Vec<_>, Vec<_>) = ((1..5).map(frame).collect(), (10..13).map(frame).collect());
+        let lit = Grid::from_vec(
+            width,
+            height,
+            (0..width * height).map(|at| !random(99 + at as u64).is_multiple_of(3)).collect(),
+        );
+        // Sums of [raw, DOLP, raw between lit pixels, DOLP between lit pixels] by row, then over rows.
+        let (mut total, mut lit_pairs) = ([0.0f64; 4], 0u32);
+        for y in 0..height {
+            let mut row = [0.0f64; 4];
+            for frame in &code {
+                for x in 0..width {
+                    let at = y * width + x;
+                    let here = grey(frame, &dark, at);
+                    let right = (x + 1 < width).then_some(at + 1);
+                    let below = (y + 1 < height).then_some(at + width);
+                    for other in right.into_iter().chain(below) {
+                        let there = grey(frame, &dark, other);
+                        let both = lit.data()[at] && lit.data()[other];
+                        let squares = [(here.0 - there.0).powi(2), (here.1 - there.1).powi(2)].map(f64::from);
+                        for (index, square) in squares.into_iter().enumerate() {
+                            row[index] += square;
+                            row[index + 2] += if both { square } else { 0.0 };
+                        }
+                        lit_pairs += u32::from(both);
+                    }
+                }
+            }
+            for (total, row) in total.iter_mut().zip(row) {
+                *total += row;
+            }
+        }
+        let pairs = 2.0 * (lit.len() * code.len()) as f64;
+        let of_lit = f64::from(lit_pairs);
+        let expected = [total[0] / pairs, total[1] / pairs, total[2] / of_lit, total[3] / of_lit];
+        let code: Vec<_> = code.iter().map(|plane| Plane::U16(plane)).collect();
+        let dark: Vec<_> = dark.iter().map(|plane| Plane::U16(plane)).collect();
+        for threads in [1, 2] {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            let found = pool.install(|| contrast(&code, &dark, 12, 41.5, &lit)).unwrap();
+            let found = [found.raw, found.dolp, found.raw_lit, found.dolp_lit];
+            assert_eq!(
+                found.map(f64::to_bits),
+                expected.map(f64::to_bits),
+                "{threads} threads: {found:?} {expected:?}"
+            );
+        }
+    }
 }
