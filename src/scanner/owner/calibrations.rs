@@ -80,9 +80,10 @@ impl Owner {
     /// Gives the rig to a calibration that was admitted.
     pub(super) fn start_calibration(
         &mut self,
-        record: CalibrationRecord,
+        mut record: CalibrationRecord,
         task: Task,
     ) -> Result<Arc<CalibrationRecord>, Denied> {
+        record.revision = self.out.events.next();
         let (id, store) = (record.id.clone(), self.library.calibrations());
         // Known on the disk before the rig moves: a crash leaves an interrupted calibration, not none.
         store.write(&record).map_err(|error| Denied::Storage(chain(&error)))?;

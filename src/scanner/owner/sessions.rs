@@ -34,6 +34,8 @@ impl Owner {
         let session = Session::new(&self.settings.raw.rig.name, board, *gates, *baseline_mm);
         record.state = CalibrationState::Open;
         record.session = Some(SessionState::empty(&session));
+        // As the event will say that tells of it.
+        record.revision = self.out.events.next();
         let store = self.library.calibrations();
         let folder = store.session(&id).map_err(|error| Denied::Storage(chain(&error)))?;
         session.write(&folder).map_err(|failure| Denied::Storage(failure.chain()))?;
@@ -109,6 +111,7 @@ impl Owner {
         let mut closed = self.calibration(id)?.as_ref().clone();
         closed.blame("cancelled", "the session was closed");
         closed.end(CalibrationState::Cancelled, now());
+        closed.revision = self.out.events.next();
         self.library.calibrations().write(&closed).map_err(|error| Denied::Storage(chain(&error)))?;
         self.edit_calibration(id, |record| *record = closed);
         self.touch_calibration(id);
