@@ -111,8 +111,9 @@ is given; it finds columns, rows and its shadow mask. numpy finds columns, rows 
 
 const STAGES: &str = "
 `noise`: camera noise from the frames, where no calibration gives it. `words`: references, pair accumulation, noise
-gates, Gray decode and classes in one pass over all frames. `pair-sums`: the proof that the frames show what was
-projected. `gates`: legal boundaries, vote, interreflection. `subpixel-*`: coordinates finer than a pixel, columns and
-rows. `triangulator`: what is prepared once for a calibration. `cloud`: points, gates, normals and flags. `ply`: the
-point cloud as a file in memory. `contrast`: the picture contrast of the report.
+gates, Gray decode and classes in one pass over all frames, into maps that lie in memory already (getting 60 MB from the
+system takes as long again; it counts in *codes*). `pair-sums`: the proof that the frames show what was projected.
+`gates`: legal boundaries, vote, interreflection. `subpixel-*`: coordinates finer than a pixel, columns and rows.
+`triangulator`: what is prepared once for a calibration. `cloud`: points, gates, normals and flags. `ply`: the point
+cloud as a file in memory. `contrast`: the picture contrast of the report.
 ";

@@ -8,6 +8,7 @@ use super::{
     noise, pair_sum,
     plan::{Frames, plan},
     sample::Sample,
+    simd::InstructionSet,
     subpixel,
     types::{Class, DecodeError, DecodeSettings, Decoded, Plane, SharedPlane},
     words::{PixelMaps, decode_pixels},
@@ -155,10 +156,12 @@ fn decode<T: Sample>(
         },
     };
     let gates = Gates::new(settings, noise);
-    let mut maps = decode_pixels(&frames, &gates);
-    let pairs = pair_sum::of_scan(&frames, &maps, &gates);
+    let mut maps = PixelMaps::new(settings.width * settings.height, frames.axes.len());
+    let set = InstructionSet::widest();
+    decode_pixels(&frames, &gates, set, &mut maps);
+    let pairs = pair_sum::of_scan(&frames, &maps, &gates, set);
     let drift = drift(&frames, &maps);
-    let (boundaries, shapes) = gates::apply(&frames, &mut maps, &settings.thresholds);
+    let (boundaries, shapes) = gates::apply(&frames, &mut maps, &settings.thresholds, set);
     codes_done();
     let mut refined = shapes
         .iter()

@@ -16,13 +16,19 @@
 //! **Interreflection.** The smallest |P - Q| / |C| of the coarse bits away from their own edges is 1 in theory. Below
 //! a third of its median over the image, and significantly so, the light of the pattern comes from elsewhere too.
 
+#[cfg(test)]
+pub(crate) mod plain;
+mod steps;
+
 use polscan_patterns::Axis;
 use rayon::prelude::*;
 
+use self::steps::{Crossings, RowSteps, StepCounts};
 use super::{
     plan::Frames,
+    simd::{InstructionSet, Work},
     types::{Class, Thresholds},
-    words::{PixelMaps, WEAK_SCALE, WEAK_UNKNOWN},
+    words::{BLOCK, PixelMaps, WEAK_SCALE, WEAK_UNKNOWN},
 };
 
 /// Dissenting neighbours that outvote a single supporter: more than the four that the end of a line one pixel wide has
@@ -60,27 +66,6 @@ impl BoundaryCheck {
     }
 }
 
-/// Crossings of one bit.
-#[derive(Debug, Clone, Copy, Default)]
-struct Crossings {
-    legal: u64,
-    illegal: u64,
-    rising: u64,
-    falling: u64,
-    /// Sum of the steps of legal crossings along the axis' direction.
-    travel: i64,
-}
-
-impl Crossings {
-    fn add(&mut self, other: Self) {
-        self.legal += other.legal;
-        self.illegal += other.illegal;
-        self.rising += other.rising;
-        self.falling += other.falling;
-        self.travel += other.travel;
-    }
-}
-
 /// How the values of one axis vary over the image.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct AxisShape {
@@ -97,6 +82,8 @@ struct AxisView<'a> {
     height: usize,
     shape: AxisShape,
     suspect: u32,
+    /// Per block of each row: whether a pixel of it may lie beside a crossing that is longer than a step.
+    jumps: Vec<bool>,
 }
 
 /// Runs all gates and returns the crossings of each bit and the shape of each axis.
@@ -104,17 +91,19 @@ pub(crate) fn apply<T: Sync>(
     frames: &Frames<'_, T>,
     maps: &mut PixelMaps,
     thresholds: &Thresholds,
+    set: InstructionSet,
 ) -> (Vec<BoundaryCheck>, Vec<AxisShape>) {
-    let (width, height) = (frames.width, frames.height);
+    let size = [frames.width, frames.height];
     let mut checks = Vec::new();
     let mut views = Vec::new();
     for (index, axis) in frames.axes.iter().enumerate() {
         let values = &maps.values[index][..];
         let snap = (2.0 * thresholds.snap_px / f64::from(1u32 << axis.code.shift)).floor() as i32;
-        let shape = axis_shape(values, width, height, snap);
-        let mut view = AxisView { values, width, height, shape, suspect: 0 };
-        let crossings = view.count_crossings(axis.code.bits);
+        let shape = axis_shape(values, size, snap, set);
+        let (crossings, jumps) = count_crossings(values, size, shape, axis.code.bits, set);
         let rises = crossings.iter().map(|crossing| crossing.travel).sum::<i64>() >= 0;
+        let [width, height] = size;
+        let mut view = AxisView { values, width, height, shape, suspect: 0, jumps };
         for (bit, crossing) in crossings.into_iter().enumerate() {
             let Crossings { legal, illegal, rising, falling, .. } = crossing;
             let against = if rises { falling } else { rising };
@@ -127,28 +116,14 @@ pub(crate) fn apply<T: Sync>(
         views.push(view);
     }
     let weak_below = weak_threshold(&maps.weakest);
-    let before = &maps.class[..];
-    let mut gated = before.to_vec();
-    gated.par_chunks_mut(width).enumerate().for_each(|(y, row)| {
-        for (x, class) in row.iter_mut().enumerate() {
-            if !class.is_valid() {
-                continue;
-            }
-            let weakest = maps.weakest[y * width + x];
-            if views.iter().any(|view| view.is_off_boundary(x, y)) {
-                *class = Class::OffBoundary;
-            } else if weakest != WEAK_UNKNOWN && f32::from(weakest) < weak_below {
-                *class = Class::Interreflection;
-            }
-        }
+    let mut gated = maps.class.clone();
+    gated.par_chunks_mut(frames.width).enumerate().for_each(|(y, class)| {
+        let weakest = &maps.weakest[y * frames.width..][..frames.width];
+        set.run(GateRow { class, weakest, weak_below, views: &views, y });
     });
     let before = gated.clone();
-    gated.par_chunks_mut(width).enumerate().for_each(|(y, row)| {
-        for (x, class) in row.iter_mut().enumerate() {
-            if class.is_valid() && is_outvoted(&before, &views, x, y) {
-                *class = Class::Vote;
-            }
-        }
+    gated.par_chunks_mut(frames.width).enumerate().for_each(|(y, class)| {
+        set.run(VoteRow { class, before: &before, views: &views, y });
     });
     let shapes = views.iter().map(|view| view.shape).collect();
     maps.class = gated;
@@ -156,50 +131,61 @@ pub(crate) fn apply<T: Sync>(
 }
 
 /// Direction and step of the values. Large differences (depth jumps, wrong words) are kept out by their rarity.
-fn axis_shape(values: &[i32], width: usize, height: usize, snap: i32) -> AxisShape {
-    const CAP: usize = 64;
-    let count = |offset: usize, columns: usize, rows: usize| -> Vec<u64> {
-        (0..rows)
-            .into_par_iter()
-            .map(|y| {
-                let mut counts = vec![0u64; CAP + 1];
-                for at in y * width..y * width + columns {
-                    let (here, there) = (values[at], values[at + offset]);
-                    if here >= 0 && there >= 0 {
-                        counts[(here.abs_diff(there) as usize).min(CAP)] += 1;
-                    }
-                }
+fn axis_shape(values: &[i32], [width, height]: [usize; 2], snap: i32, set: InstructionSet) -> AxisShape {
+    let [along_x, along_y] = (0..height)
+        .into_par_iter()
+        .fold(
+            || [StepCounts::new(), StepCounts::new()],
+            |mut counts, y| {
+                let row = &values[y * width..][..width];
+                let next = values.get((y + 1) * width..(y + 2) * width).unwrap_or_default();
+                set.run(RowSteps { row, next, counts: &mut counts });
                 counts
-            })
-            .reduce(|| vec![0; CAP + 1], |a, b| a.iter().zip(&b).map(|(a, b)| a + b).collect())
-    };
-    let along_x = count(1, width.saturating_sub(1), height);
-    let along_y = count(width, width, height.saturating_sub(1));
-    // Mean of the smaller 95 %.
-    let variation = |counts: &[u64]| {
-        let total: u64 = counts.iter().sum();
-        let mut left = total - total / 20;
-        let mut sum = 0;
-        for (size, &count) in counts.iter().enumerate() {
-            let taken = count.min(left);
-            sum += taken * size as u64;
-            left -= taken;
-        }
-        sum as f64 / total.max(1) as f64
-    };
-    let vertical = variation(&along_y) > variation(&along_x);
-    let counts = if vertical { &along_y } else { &along_x };
-    let total: u64 = counts.iter().sum();
-    let mut below = 0;
-    let mut typical = 0;
-    for (size, &count) in counts.iter().enumerate() {
-        below += count;
-        if below * 10 >= total * 9 {
-            typical = size as i32;
-            break;
-        }
-    }
+            },
+        )
+        .reduce(
+            || [StepCounts::new(), StepCounts::new()],
+            |[x, y], [more_x, more_y]| [x + more_x, y + more_y],
+        );
+    let vertical = along_y.variation() > along_x.variation();
+    let typical = if vertical { &along_y } else { &along_x }.typical();
     AxisShape { along_y: vertical, step: snap.max(2 * typical).max(2) }
+}
+
+/// Crossings of each bit, and the blocks that hold more than one step between neighbours.
+fn count_crossings(
+    values: &[i32],
+    [width, height]: [usize; 2],
+    shape: AxisShape,
+    bits: u8,
+    set: InstructionSet,
+) -> (Vec<Crossings>, Vec<bool>) {
+    let blocks = width.div_ceil(BLOCK);
+    let zero = || vec![Crossings::default(); usize::from(bits)];
+    let mut across = vec![false; blocks * height];
+    let mut down = vec![false; blocks * height];
+    let crossings = across
+        .par_chunks_mut(blocks)
+        .zip(down.par_chunks_mut(blocks))
+        .enumerate()
+        .fold(zero, |mut counts, (y, (across, down))| {
+            let row = &values[y * width..][..width];
+            let next = values.get((y + 1) * width..(y + 2) * width).unwrap_or_default();
+            set.run(steps::RowCrossings { row, next, shape, counts: &mut counts, across, down });
+            counts
+        })
+        .reduce(zero, |mut sum, more| {
+            sum.iter_mut().zip(more).for_each(|(sum, more)| sum.add(more));
+            sum
+        });
+    // A crossing lies between a pixel and the next one, of the same block, the next block or the row below.
+    let jumps = (0..blocks * height)
+        .map(|at| {
+            let before = at % blocks > 0 && across[at - 1];
+            across[at] || before || down[at] || (at >= blocks && down[at - blocks])
+        })
+        .collect();
+    (crossings, jumps)
 }
 
 /// Level below which the stored weakness is suspicious: a share of the median.
@@ -218,56 +204,87 @@ fn weak_threshold(weakest: &[u8]) -> f32 {
     WEAK_SHARE * median
 }
 
-fn gray(value: i32) -> u32 {
+pub(crate) fn gray(value: i32) -> u32 {
     (value ^ (value >> 1)) as u32
 }
 
-impl AxisView<'_> {
-    /// Crossings of each bit.
-    fn count_crossings(&self, bits: u8) -> Vec<Crossings> {
-        let bits = usize::from(bits);
-        let zero = || vec![Crossings::default(); bits];
-        (0..self.height)
-            .into_par_iter()
-            .map(|y| {
-                let mut counts = zero();
-                let row = &self.values[y * self.width..][..self.width];
-                row.windows(2).for_each(|two| self.count(two[0], two[1], !self.shape.along_y, &mut counts));
-                if y + 1 < self.height {
-                    let next = &self.values[(y + 1) * self.width..][..self.width];
-                    let down = row.iter().zip(next);
-                    down.for_each(|(&here, &there)| self.count(here, there, self.shape.along_y, &mut counts));
+/// Legal boundaries and interreflection of one row.
+struct GateRow<'a> {
+    class: &'a mut [Class],
+    weakest: &'a [u8],
+    weak_below: f32,
+    views: &'a [AxisView<'a>],
+    y: usize,
+}
+
+impl Work for GateRow<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run(self) {
+        let Self { class, weakest, weak_below, views, y } = self;
+        // Boundaries go first, and a pixel that they reject is not looked at again.
+        let blocks = class.len().div_ceil(BLOCK);
+        for (block, class) in class.chunks_mut(BLOCK).enumerate() {
+            if views.iter().any(|view| view.jumps[y * blocks + block]) {
+                for (x, class) in class.iter_mut().enumerate().filter(|(_, class)| class.is_valid()) {
+                    if views.iter().any(|view| view.is_off_boundary(block * BLOCK + x, y)) {
+                        *class = Class::OffBoundary;
+                    }
                 }
-                counts
-            })
-            .reduce(zero, |mut sum, more| {
-                sum.iter_mut().zip(more).for_each(|(sum, more)| sum.add(more));
-                sum
-            })
-    }
-
-    fn count(&self, here: i32, there: i32, along: bool, counts: &mut [Crossings]) {
-        if here < 0 || there < 0 || here == there {
-            return;
+            }
         }
-        let mut changed = gray(here) ^ gray(there);
-        let legal = here.abs_diff(there) as i32 <= self.shape.step;
-        if !legal && changed.count_ones() > 1 {
-            return;
-        }
-        while changed != 0 {
-            let entry = &mut counts[counts.len() - 1 - changed.trailing_zeros() as usize];
-            entry.add(Crossings {
-                legal: u64::from(legal),
-                illegal: u64::from(!legal),
-                rising: u64::from(legal && along && there > here),
-                falling: u64::from(legal && along && there < here),
-                travel: if legal && along { i64::from(there - here) } else { 0 },
-            });
-            changed &= changed - 1;
+        for (class, &weakest) in class.iter_mut().zip(weakest) {
+            let weak = (weakest != WEAK_UNKNOWN) & (f32::from(weakest) < weak_below);
+            *class = if weak & class.is_valid() { Class::Interreflection } else { *class };
         }
     }
+}
 
+/// The vote of one row.
+struct VoteRow<'a> {
+    class: &'a mut [Class],
+    before: &'a [Class],
+    views: &'a [AxisView<'a>],
+    y: usize,
+}
+
+impl Work for VoteRow<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run(self) {
+        let Self { class, before, views, y } = self;
+        let width = class.len();
+        let at = y * width;
+        // Whether a pixel and the next one are valid and agree: both neighbours along the row are support enough.
+        let mut agrees = [0u8; BLOCK + 1];
+        for start in (0..width).step_by(BLOCK) {
+            let end = (start + BLOCK).min(width);
+            // From the pixel before the block to the last of it; those at the rim of the image lack a neighbour.
+            let first = start.max(1) - 1;
+            let pairs = end.min(width - 1) - first;
+            let offset = first + 1 - start;
+            agrees.fill(0);
+            steps::both_valid(&before[at + first..][..pairs + 1], &mut agrees[offset..offset + pairs]);
+            for view in views {
+                let values = &view.values[at + first..][..pairs + 1];
+                steps::within(values, view.shape.step.max(2), &mut agrees[offset..offset + pairs]);
+            }
+            let class = &mut class[start..end];
+            if !steps::any_alone(class, &agrees[..class.len() + 1]) {
+                continue;
+            }
+            for (x, class) in class.iter_mut().enumerate().filter(|(_, class)| class.is_valid()) {
+                if agrees[x] & agrees[x + 1] == 0 && is_outvoted(before, views, start + x, y) {
+                    *class = Class::Vote;
+                }
+            }
+        }
+    }
+}
+
+impl AxisView<'_> {
     /// Whether a crossing between this valid pixel and one of its four neighbours is where no boundary can be.
     fn is_off_boundary(&self, x: usize, y: usize) -> bool {
         let at = y * self.width + x;

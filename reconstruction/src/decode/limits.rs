@@ -43,16 +43,19 @@ impl Gates {
     }
 
     /// Variance of one sample at `dn`.
+    #[inline(always)]
     pub fn variance(&self, dn: f32) -> f32 {
         self.fixed_variance() + self.noise.gain_dn_per_electron as f32 * (dn - self.black_dn).max(0.0)
     }
 
+    #[inline(always)]
     fn fixed_variance(&self) -> f32 {
         (self.noise.read_noise_dn * self.noise.read_noise_dn + 1.0 / 12.0) as f32
     }
 
     /// Degree of linear polarization of a sample against the dark reference, both in DN (Eq. 5): 0 where their sum is
     /// not positive after dark subtraction.
+    #[inline(always)]
     pub fn dolp(&self, dn: f32, dark_dn: f32) -> f32 {
         let sum = dn + dark_dn - 2.0 * self.black_dn;
         if sum > 0.0 { (dn - dark_dn) / sum } else { 0.0 }

@@ -7,7 +7,6 @@ mod accumulate;
 mod contrast;
 mod edge_image;
 mod gates;
-mod kernels;
 mod limits;
 mod noise;
 #[cfg(test)]
@@ -15,12 +14,14 @@ mod oracle;
 mod pair_sum;
 mod plan;
 mod sample;
+mod simd;
 #[cfg(feature = "synthetic")]
 mod stages;
 mod subpixel;
 #[cfg(any(test, feature = "synthetic"))]
 pub mod synth;
 mod types;
+mod whole;
 mod words;
 
 pub use accumulate::Accumulator;

@@ -9,16 +9,19 @@
 //! takes few values, on which a median absolute deviation would jump; each is therefore moved by a fixed pseudo-random
 //! part of a step within +-1/2 DN, whose variance of 1/12 DN^2 is counted.
 
-use polscan_patterns::Axis;
-use rayon::prelude::*;
+#[cfg(test)]
+pub(crate) mod plain;
+mod scan;
 
+use polscan_patterns::Axis;
+
+use self::scan::Counts;
+pub(crate) use self::scan::of_scan;
 use super::{
     limits::Gates,
     noise,
-    plan::{Frames, Levels, axis_position},
     sample::Sample,
-    types::{CameraResponse, Class, NoiseModel, PairResidual, Plane},
-    words::PixelMaps,
+    types::{CameraResponse, NoiseModel, PairResidual, Plane},
 };
 
 /// Rows that are looked at after a scan, and for a single pair while the next ones are waiting.
@@ -104,21 +107,53 @@ struct Tally {
 }
 
 impl Tally {
+    /// Number of bins.
+    const BINS: usize = (2.0 * RANGE_SIGMA * BINS_PER_SIGMA) as usize;
+    /// Bin of what is not counted.
+    const NOWHERE: u16 = Self::BINS as u16;
+
     fn new() -> Self {
-        Self { bins: vec![0; (2.0 * RANGE_SIGMA * BINS_PER_SIGMA) as usize], flat: [0; 2], edge: [0; 2] }
+        Self { bins: vec![0; Self::BINS + 1], flat: [0; 2], edge: [0; 2] }
+    }
+
+    /// Place of a residual among the bins; its whole part is the bin.
+    #[inline(always)]
+    fn place(residual: f32) -> f32 {
+        ((residual + RANGE_SIGMA) * BINS_PER_SIGMA).max(0.0).min((Self::BINS - 1) as f32)
     }
 
     fn add(&mut self, residual: f32, flat: bool) {
-        let at = ((residual + RANGE_SIGMA) * BINS_PER_SIGMA).max(0.0) as usize;
-        let last = self.bins.len() - 1;
-        self.bins[at.min(last)] += 1;
+        self.bins[Self::place(residual) as usize] += 1;
         let kind = if flat { &mut self.flat } else { &mut self.edge };
         kind[0] += 1;
         kind[1] += u64::from(residual.abs() > OUTLIER_SIGMA);
     }
 
+    /// Adds many residuals by their bins.
+    fn count(&mut self, bins: &[u16], Counts { edge, all }: Counts) {
+        // A length that the compiler knows spares it the check of each index.
+        if let Some(all_bins) = self.bins.first_chunk_mut::<{ Self::BINS + 1 }>() {
+            for &bin in bins {
+                all_bins[usize::from(bin.min(Self::NOWHERE))] += 1;
+            }
+        }
+        for kind in 0..2 {
+            self.edge[kind] += edge[kind];
+            self.flat[kind] += all[kind] - edge[kind];
+        }
+    }
+
+    fn join(&mut self, other: &Self) {
+        self.bins.iter_mut().zip(&other.bins).for_each(|(sum, more)| *sum += more);
+        for kind in 0..2 {
+            self.edge[kind] += other.edge[kind];
+            self.flat[kind] += other.flat[kind];
+        }
+    }
+
     fn finish(&self, axis: Axis, bit: u8) -> PairResidual {
-        let total: u64 = self.bins.iter().sum();
+        let bins = &self.bins[..Self::BINS];
+        let total: u64 = bins.iter().sum();
         let share = |[all, beyond]: [u64; 2]| if all == 0 { 0.0 } else { beyond as f64 / all as f64 };
         if total == 0 {
             let nothing = f64::NAN;
@@ -135,7 +170,7 @@ impl Tally {
         let half = total as f64 / 2.0;
         let mut below = 0.0;
         let mut median = 0.0;
-        for (index, &count) in self.bins.iter().enumerate() {
+        for (index, &count) in bins.iter().enumerate() {
             if below + count as f64 >= half {
                 median = index as f64 + (half - below) / count as f64;
                 break;
@@ -144,17 +179,17 @@ impl Tally {
         }
         // Median absolute deviation in bins: the distance that holds half of the counts.
         let cumulative: Vec<f64> = std::iter::once(0.0)
-            .chain(self.bins.iter().scan(0.0, |sum, &count| {
+            .chain(bins.iter().scan(0.0, |sum, &count| {
                 *sum += count as f64;
                 Some(*sum)
             }))
             .collect();
         let rank = |position: f64| {
-            let position = position.clamp(0.0, self.bins.len() as f64);
-            let index = (position as usize).min(self.bins.len() - 1);
+            let position = position.clamp(0.0, bins.len() as f64);
+            let index = (position as usize).min(bins.len() - 1);
             cumulative[index] + (cumulative[index + 1] - cumulative[index]) * (position - index as f64)
         };
-        let (mut near, mut far) = (0.0, self.bins.len() as f64);
+        let (mut near, mut far) = (0.0, bins.len() as f64);
         for _ in 0..48 {
             let middle = (near + far) / 2.0;
             if rank(median + middle) - rank(median - middle) < half {
@@ -276,70 +311,4 @@ fn neighbours<const N: usize>(
         .into_iter()
         .flatten()
     })
-}
-
-/// Residuals of all pairs of a scan, in order of axis and bit.
-pub(crate) fn of_scan<T: Sample>(
-    frames: &Frames<'_, T>,
-    maps: &PixelMaps,
-    gates: &Gates,
-) -> Vec<PairResidual> {
-    let (width, height) = (frames.width, frames.height);
-    let pair_count = frames.pair_count();
-    let rows: Vec<usize> = sampled_rows(height, ROWS).collect();
-    // Expected sum, 1/sigma (0 where a pixel is not looked at) and the bits that change nearby, once for all pairs.
-    let expected: Vec<(f32, f32, [u16; 2])> = rows
-        .par_iter()
-        .flat_map_iter(|&y| {
-            (0..width).map(move |x| {
-                let at = y * width + x;
-                let class = maps.class[at];
-                if !class.is_lit() || class == Class::Saturated {
-                    return (0.0, 0.0, [0; 2]);
-                }
-                let expected = match frames.levels {
-                    Levels::References => from_references(&frames.high, &frames.low, at, gates),
-                    _ => {
-                        let sum: i32 = frames.pairs().map(|(_, _, p, q)| p[at].dn() + q[at].dn()).sum();
-                        let kept = 1.0 - 1.0 / pair_count as f32;
-                        let variance = maps.sigma[at] * maps.sigma[at] * kept + DITHER_VARIANCE;
-                        (pair_count > 1).then(|| Expected {
-                            sum: sum as f32 / pair_count as f32,
-                            per_sigma: variance.sqrt().recip(),
-                        })
-                    }
-                };
-                let Some(expected) = expected else { return (0.0, 0.0, [0; 2]) };
-                let mut changed = [0u16; 2];
-                for (changed, words) in
-                    changed.iter_mut().zip(&maps.words).filter(|(_, words)| !words.is_empty())
-                {
-                    *changed = neighbours(NEAR_EDGE, [x, y], [width, height])
-                        .fold(0, |sum, other| sum | (words[other] ^ words[at]));
-                }
-                (expected.sum, expected.per_sigma, changed)
-            })
-        })
-        .collect();
-    let pairs: Vec<_> = frames.pairs().collect();
-    pairs
-        .par_iter()
-        .map(|&(axis, bit, p, q)| {
-            let mut tally = Tally::new();
-            let index = axis_position(frames, axis);
-            let mask = 1u16 << (frames.axes[index].code.bits - 1 - bit);
-            for (row, &y) in expected.chunks(width).zip(&rows) {
-                for (x, &(sum, per_sigma, changed)) in row.iter().enumerate() {
-                    let at = y * width + x;
-                    let (p, q) = (p[at].dn(), q[at].dn());
-                    if per_sigma == 0.0 || p >= gates.saturation_dn || q >= gates.saturation_dn {
-                        continue;
-                    }
-                    let residual = (p + q) as f32 - sum + dither(at);
-                    tally.add(residual * per_sigma, changed[index] & mask == 0);
-                }
-            }
-            tally.finish(axis, bit)
-        })
-        .collect()
 }

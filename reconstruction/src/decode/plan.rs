@@ -21,8 +21,6 @@ pub(crate) enum BitFrames<'a, T> {
 pub(crate) struct AxisFrames<'a, T> {
     pub axis: Axis,
     pub code: PrefixCode,
-    /// Value of each word, -1 outside the projector.
-    pub values: Vec<i32>,
     pub bits: Vec<BitFrames<'a, T>>,
 }
 
@@ -47,12 +45,6 @@ impl PrefixCode {
         let last = first + (1 << self.shift) - 1;
         let (first, last) = (first.max(0), last.min(self.code.size() as i32 - 1));
         (first <= last).then_some((first, last))
-    }
-
-    /// Value of a word, `None` outside the projector.
-    pub fn value(self, word: u16) -> Option<i32> {
-        let value = i32::from(binary_of_gray(word));
-        self.span(value).map(|_| value)
     }
 
     /// Which of the known bits changes between `value` and `value + 1`.
@@ -174,8 +166,7 @@ pub(crate) fn plan<'a, T: Sample>(
         }
         tell_losses(axis, code, &found, bits.len(), &mut losses);
         let code = PrefixCode::new(code, bits.len() as u8);
-        let values = (0..1u32 << code.bits).map(|word| code.value(word as u16).unwrap_or(-1)).collect();
-        axes.push(AxisFrames { axis, code, values, bits });
+        axes.push(AxisFrames { axis, code, bits });
     }
     let levels = match (high.is_empty(), low.is_empty()) {
         _ if mode == Mode::Paper => Levels::Pairs,
@@ -243,6 +234,7 @@ fn tell_losses<T>(
 }
 
 /// Binary value of a reflected Gray word: each bit is the parity of the word's bits from the top down to it.
+#[inline(always)]
 pub(crate) fn binary_of_gray(word: u16) -> u16 {
     let value = word ^ (word >> 8);
     let value = value ^ (value >> 4);

@@ -11,9 +11,10 @@ use super::{
     noise, pair_sum,
     plan::plan,
     sample::Sample,
+    simd::InstructionSet,
     subpixel,
     types::{DecodeError, DecodeSettings, Plane, SharedPlane},
-    words::decode_pixels,
+    words::{PixelMaps, decode_pixels},
 };
 
 /// Calls `visit` with the name of each stage and with what does the stage's work once each time that it is called.
@@ -43,20 +44,19 @@ fn typed<T: Sample>(
         black_box(noise::estimate(&frames, camera.bit_depth, black_level_dn, camera.saturation_dn));
     });
     let gates = Gates::new(settings, camera.noise.unwrap_or_else(|| noise::assumed(camera.bit_depth)));
-    visit("words", &mut || {
-        black_box(decode_pixels(&frames, &gates));
-    });
-    let mut maps = decode_pixels(&frames, &gates);
+    let set = InstructionSet::widest();
+    let mut maps = PixelMaps::new(frames.width * frames.height, frames.axes.len());
+    visit("words", &mut || decode_pixels(&frames, &gates, set, black_box(&mut maps)));
     visit("pair-sums", &mut || {
-        black_box(pair_sum::of_scan(&frames, &maps, &gates));
+        black_box(pair_sum::of_scan(&frames, &maps, &gates, set));
     });
     let before = maps.class.clone();
     visit("gates", &mut || {
         maps.class.clone_from(&before);
-        black_box(gates::apply(&frames, &mut maps, &settings.thresholds));
+        black_box(gates::apply(&frames, &mut maps, &settings.thresholds, set));
     });
     maps.class = before;
-    let (_, shapes) = gates::apply(&frames, &mut maps, &settings.thresholds);
+    let (_, shapes) = gates::apply(&frames, &mut maps, &settings.thresholds, set);
     for (index, shape) in shapes.iter().enumerate() {
         visit(if index == 0 { "subpixel-first-axis" } else { "subpixel-second-axis" }, &mut || {
             black_box(subpixel::refine(&frames, &maps, &gates, &settings.thresholds, index, *shape));

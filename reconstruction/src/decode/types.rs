@@ -172,11 +172,13 @@ impl Class {
     ];
 
     /// Whether the pixel carries a measurement.
+    #[inline(always)]
     pub fn is_valid(self) -> bool {
         matches!(self, Self::Valid | Self::Edge | Self::Inverted)
     }
 
     /// Whether the pixel saw projector light (everything but `Unlit`).
+    #[inline(always)]
     pub fn is_lit(self) -> bool {
         self != Self::Unlit
     }

@@ -1,4 +1,5 @@
-//! From samples to words and classes, one row at a time over all planes, so that each byte is read once.
+//! From samples to words and classes, one block of a row at a time over all planes, so that each byte is fetched once
+//! and what lives only within a block stays in the nearest cache.
 //!
 //! Gates are in units of noise. With references of `n` frames each, `sigma(C)^2 = var(R_H)/n_H + var(R_V)/n_V`. A pair
 //! sums to the references' sum, so `sigma(P - Q)` is the same for all pairs of a pixel:
@@ -9,28 +10,41 @@
 //! 0.80 sigma(P - Q) and, with at least eight pairs, hardly ever over 1.5, so that the gate of
 //! `lit_sigma * sigma(P - Q) / sqrt(2)` (2.8 sigma; the same gate that references of two frames give) passes none.
 
+mod classes;
+mod kernels;
+pub(crate) mod levels;
+#[cfg(test)]
+pub(crate) mod plain;
+mod resolve;
+
+use std::ops::Range;
+
 use polscan_patterns::Mode;
 use rayon::prelude::*;
 
+use self::{
+    kernels::{Bits, Peaks, Weakest},
+    levels::BlockLevels,
+};
 use super::{
-    kernels::{WEAK_BIT_SHIFT, pair_bit, pair_sum, track_weakest},
     limits::Gates,
-    plan::{AxisFrames, BitFrames, Frames, Levels, PrefixCode, binary_of_gray},
+    plan::{AxisFrames, BitFrames, Frames, PrefixCode},
     sample::Sample,
+    simd::{InstructionSet, Work},
     types::Class,
 };
 
 /// Bits whose boundaries lie at least this far apart (in values) are coarse: the pattern is flat between them.
 const COARSE_SPACING: u32 = 16;
-/// A coarse bit may be weak this near to its own boundary, in values.
-const EDGE_REACH: i32 = 7;
-/// Weakness is judged where |C| is at least this many sigma of P - Q.
-const WEAK_JUDGED: f32 = 9.0;
 /// Scale of the stored weakness; `WEAK_UNKNOWN` where it is not judged.
 pub(crate) const WEAK_SCALE: f32 = 128.0;
 pub(crate) const WEAK_UNKNOWN: u8 = u8::MAX;
+/// Pixels of a block: what is kept of each during a decode (about 50 bytes) and their samples of one pair fit into the
+/// nearest cache together.
+pub(crate) const BLOCK: usize = 512;
 
 /// One image of every per-pixel result.
+#[derive(Debug, Clone)]
 pub(crate) struct PixelMaps {
     pub class: Vec<Class>,
     /// Words as read (bits without meaning where the class is unlit), per axis of the plan.
@@ -48,7 +62,7 @@ pub(crate) struct PixelMaps {
     pub weakest: Vec<u8>,
 }
 
-/// The same for one row.
+/// The same for one row, or for a part of one.
 struct RowMaps<'a> {
     class: &'a mut [Class],
     words: [&'a mut [u16]; 2],
@@ -62,27 +76,61 @@ struct RowMaps<'a> {
     weakest: &'a mut [u8],
 }
 
-/// Decodes all pixels, each on its own.
-pub(crate) fn decode_pixels<T: Sample>(frames: &Frames<'_, T>, gates: &Gates) -> PixelMaps {
-    let (width, len) = (frames.width, frames.width * frames.height);
-    let axis_len = |index: usize| if frames.axes.len() > index { len } else { 0 };
-    let mut maps = PixelMaps {
-        class: vec![Class::Unlit; len],
-        words: [0, 1].map(|axis| vec![0; axis_len(axis)]),
-        values: [0, 1].map(|axis| vec![-1; axis_len(axis)]),
-        half_saturated: vec![false; len],
-        modulation: vec![0.0; len],
-        sigma: vec![0.0; len],
-        residual: vec![f32::NAN; len],
-        dolp: vec![0.0; len],
-        intensity: vec![0; len],
-        weakest: vec![WEAK_UNKNOWN; len],
-    };
-    split_rows(&mut maps, width)
-        .into_par_iter()
-        .enumerate()
-        .for_each_init(|| Scratch::new(width), |scratch, (y, row)| scratch.decode_row(frames, gates, y, row));
-    maps
+impl RowMaps<'_> {
+    #[inline(always)]
+    fn part(&mut self, at: Range<usize>) -> RowMaps<'_> {
+        let [words_0, words_1] = &mut self.words;
+        let [values_0, values_1] = &mut self.values;
+        // The second axis may be missing; its maps are then empty.
+        let second = if words_1.is_empty() { 0..0 } else { at.clone() };
+        RowMaps {
+            class: &mut self.class[at.clone()],
+            words: [&mut words_0[at.clone()], &mut words_1[second.clone()]],
+            values: [&mut values_0[at.clone()], &mut values_1[second]],
+            half_saturated: &mut self.half_saturated[at.clone()],
+            modulation: &mut self.modulation[at.clone()],
+            sigma: &mut self.sigma[at.clone()],
+            residual: &mut self.residual[at.clone()],
+            dolp: &mut self.dolp[at.clone()],
+            intensity: &mut self.intensity[at.clone()],
+            weakest: &mut self.weakest[at],
+        }
+    }
+}
+
+impl PixelMaps {
+    /// Maps of `len` pixels and `axes` axes, in memory that has been written to: the system hands out a page when it is
+    /// first touched, which takes longer than the decode itself and is better done before the last frame is there.
+    pub fn new(len: usize, axes: usize) -> Self {
+        let axis_len = |index: usize| if axes > index { len } else { 0 };
+        Self {
+            class: vec![Class::Unlit; len],
+            words: [0, 1].map(|axis| vec![u16::MAX; axis_len(axis)]),
+            values: [0, 1].map(|axis| vec![-1; axis_len(axis)]),
+            half_saturated: vec![true; len],
+            modulation: vec![f32::NAN; len],
+            sigma: vec![f32::NAN; len],
+            residual: vec![f32::NAN; len],
+            dolp: vec![f32::NAN; len],
+            intensity: vec![u8::MAX; len],
+            weakest: vec![WEAK_UNKNOWN; len],
+        }
+    }
+}
+
+/// Decodes all pixels, each on its own, into maps of the frames' size and axes. Every element is written.
+pub(crate) fn decode_pixels<T: Sample>(
+    frames: &Frames<'_, T>,
+    gates: &Gates,
+    set: InstructionSet,
+    maps: &mut PixelMaps,
+) {
+    split_rows(maps, frames.width).into_par_iter().enumerate().for_each_init(
+        Scratch::new,
+        |scratch, (y, row)| {
+            set.run(DecodeRow { scratch, frames, gates, y, row });
+        },
+    );
 }
 
 fn split_rows(maps: &mut PixelMaps, width: usize) -> Vec<RowMaps<'_>> {
@@ -114,352 +162,188 @@ fn split_rows(maps: &mut PixelMaps, width: usize) -> Vec<RowMaps<'_>> {
         .collect()
 }
 
-/// Working memory of one thread: one row of everything that lives only within a row.
-struct Scratch {
+/// Working memory of one thread: one block of everything that lives only within a block.
+struct Scratch<T> {
     /// R_H + R_V or what stands in for it, in DN.
-    level_sum: Vec<f32>,
-    /// Variance of `level_sum` and of C from the references' own noise.
-    level_variance: Vec<f32>,
+    level_sum: [f32; BLOCK],
+    levels: BlockLevels,
     /// A bit is soft where |P - Q| is at most this.
-    soft_at: Vec<i32>,
-    inverted: Vec<u16>,
-    word: Vec<u16>,
-    soft: Vec<u16>,
-    /// Bit 0: one frame of a pair saturated; bit 1: both; bit 2: a reference.
-    saturated: Vec<u8>,
-    squares: Vec<f32>,
-    pairs: Vec<u32>,
-    weakest: Vec<i32>,
-    second: Vec<i32>,
-    status: Vec<Status>,
+    soft_at: [T; BLOCK],
+    /// All ones where the polarity is exchanged.
+    inverted: [u16; BLOCK],
+    /// Bit 0: some reference saturated; bit 1: one of either kind.
+    reference_saturated: [u8; BLOCK],
+    bits: Bits<T>,
+    peaks: Peaks<T>,
+    weakest: Weakest<T>,
+    /// Smallest difference of a coarse bit away from its edges, over the axes so far; `i32::MAX` where none is known.
+    weak: [i32; BLOCK],
+    soft: [u16; BLOCK],
+    status: [u16; BLOCK],
+    squares: [f32; BLOCK],
+    pairs: [u16; BLOCK],
+    /// Variance of a pair sum's residual.
+    pair_variance: [f32; BLOCK],
+    lit: [bool; BLOCK],
 }
 
-/// What the words of the axes so far say.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-enum Status {
-    Clear,
-    Edge,
-    Outside,
-    Ambiguous,
-}
-
-impl Scratch {
-    fn new(width: usize) -> Self {
+impl<T: Sample> Scratch<T> {
+    fn new() -> Self {
         Self {
-            level_sum: vec![0.0; width],
-            level_variance: vec![0.0; width],
-            soft_at: vec![0; width],
-            inverted: vec![0; width],
-            word: vec![0; width],
-            soft: vec![0; width],
-            saturated: vec![0; width],
-            squares: vec![0.0; width],
-            pairs: vec![0; width],
-            weakest: vec![0; width],
-            second: vec![0; width],
-            status: vec![Status::Clear; width],
+            level_sum: [0.0; BLOCK],
+            levels: BlockLevels::new(),
+            soft_at: [T::default(); BLOCK],
+            inverted: [0; BLOCK],
+            reference_saturated: [0; BLOCK],
+            bits: Bits::new(),
+            peaks: Peaks::new(),
+            weakest: Weakest::new(),
+            weak: [0; BLOCK],
+            soft: [0; BLOCK],
+            status: [0; BLOCK],
+            squares: [0.0; BLOCK],
+            pairs: [0; BLOCK],
+            pair_variance: [0.0; BLOCK],
+            lit: [false; BLOCK],
         }
     }
+}
 
-    fn decode_row<T: Sample>(
+/// One row of the image.
+struct DecodeRow<'a, T> {
+    scratch: &'a mut Scratch<T>,
+    frames: &'a Frames<'a, T>,
+    gates: &'a Gates,
+    y: usize,
+    row: RowMaps<'a>,
+}
+
+impl<T: Sample> Work for DecodeRow<'_, T> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run(mut self) {
+        let width = self.frames.width;
+        for start in (0..width).step_by(BLOCK) {
+            let end = (start + BLOCK).min(width);
+            let at = self.y * width + start..self.y * width + end;
+            self.scratch.decode_block(self.frames, self.gates, at, self.row.part(start..end));
+        }
+    }
+}
+
+impl<T: Sample> Scratch<T> {
+    /// Decodes the pixels `at`, all of one row, into their part of the maps.
+    #[inline(always)]
+    fn decode_block(
         &mut self,
         frames: &Frames<'_, T>,
         gates: &Gates,
-        y: usize,
+        at: Range<usize>,
         mut row: RowMaps<'_>,
     ) {
-        let width = frames.width;
-        let at = y * width..(y + 1) * width;
-        let full = gates.saturation_dn;
-        self.saturated.fill(0);
-        self.squares.fill(0.0);
-        self.pairs.fill(0);
-        self.status.fill(Status::Clear);
-        self.levels(frames, gates, y, &mut row);
-        let mut weak = vec![f32::INFINITY; width];
+        let len = at.len();
+        self.peaks.clear(len);
+        self.weak[..len].fill(i32::MAX);
+        self.status[..len].fill(resolve::CLEAR);
+        self.find_levels(frames, gates, &at, &mut row);
         for (index, axis) in frames.axes.iter().enumerate() {
-            self.word.fill(0);
-            self.soft.fill(0);
-            self.weakest.fill(i32::MAX);
-            self.second.fill(i32::MAX);
-            for (bit, bit_frames) in axis.bits.iter().enumerate() {
-                match *bit_frames {
-                    BitFrames::Pair(p, q) => {
-                        let (p, q) = (&p[at.clone()], &q[at.clone()]);
-                        if gates.mode == Mode::Paper {
-                            self.paper_bit(p, q, &frames.low, y, gates);
-                        } else {
-                            let (soft_at, saturated) = (&self.soft_at, &mut self.saturated);
-                            pair_bit(p, q, full, soft_at, &mut self.word, &mut self.soft, saturated);
-                        }
-                        pair_sum(p, q, full, &self.level_sum, &mut self.squares, &mut self.pairs);
-                        if is_coarse(axis.code, bit as u8) {
-                            track_weakest(p, q, bit as u8, &mut self.weakest, &mut self.second);
-                        }
-                    }
-                    BitFrames::Single(plane, inverse) => self.single_bit(&plane[at.clone()], inverse, gates),
-                }
-            }
-            self.resolve(axis, index, &mut row, &mut weak);
+            self.read_bits(frames, axis, gates, &at);
+            self.resolve(axis, index, &mut row);
         }
-        self.classify(frames, gates, &mut row, &weak);
+        self.residuals(frames, gates, &at);
+        self.classify(frames, gates, &mut row);
     }
 
-    /// Reference levels, modulation, thresholds and pictures of the row.
-    fn levels<T: Sample>(&mut self, frames: &Frames<'_, T>, gates: &Gates, y: usize, row: &mut RowMaps<'_>) {
-        let width = frames.width;
-        let pair_count = frames.pair_count() as f32;
-        let mut pair_sums = vec![0i32; width];
-        let mut pair_differences = vec![0i32; width];
-        if frames.levels != Levels::References {
-            for (_, _, p, q) in frames.pairs() {
-                for x in 0..width {
-                    let (p, q) = (p[y * width + x].dn(), q[y * width + x].dn());
-                    pair_sums[x] += p + q;
-                    pair_differences[x] += (p - q).abs();
+    /// Words of one axis, its soft bits and its weakest coarse bits.
+    #[inline(always)]
+    fn read_bits(
+        &mut self,
+        frames: &Frames<'_, T>,
+        axis: &AxisFrames<'_, T>,
+        gates: &Gates,
+        at: &Range<usize>,
+    ) {
+        let len = at.len();
+        self.bits.clear(len);
+        self.weakest.clear(len);
+        for (bit, bit_frames) in axis.bits.iter().enumerate() {
+            let place = axis.code.bits - 1 - bit as u8;
+            match *bit_frames {
+                BitFrames::Pair(p, q) => {
+                    let (p, q) = (&p[at.clone()], &q[at.clone()]);
+                    if gates.mode == Mode::Paper {
+                        self.paper_bit(p, q, &frames.low, at, gates, place);
+                        self.peaks.add(p, q);
+                    } else {
+                        kernels::pair_bit(p, q, &self.soft_at, self.bits.place(place), &mut self.peaks);
+                    }
+                    if is_coarse(axis.code, bit as u8) {
+                        self.weakest.track(p, q, place);
+                    }
+                }
+                BitFrames::Single(plane, inverse) => {
+                    self.single_bit(&plane[at.clone()], inverse, gates, place);
                 }
             }
         }
-        let mean = |planes: &[&[T]], x: usize, saturated: &mut u8| {
-            let mut sum = 0i64;
-            for plane in planes {
-                let dn = plane[y * width + x].dn();
-                *saturated |= u8::from(dn >= gates.saturation_dn) << 2;
-                sum += i64::from(dn);
+    }
+
+    /// Squares of the pair sums' residuals, and of how many pairs: of those without a saturated frame.
+    #[inline(always)]
+    fn residuals(&mut self, frames: &Frames<'_, T>, gates: &Gates, at: &Range<usize>) {
+        let len = at.len();
+        self.squares[..len].fill(0.0);
+        let saturated = self.peaks.any_above(gates.saturation_dn - 1, len);
+        let (sums, squares) = (&self.level_sum[..len], &mut self.squares[..len]);
+        if saturated {
+            self.pairs[..len].fill(0);
+            for (_, _, p, q) in frames.pairs() {
+                let (p, q) = (&p[at.clone()], &q[at.clone()]);
+                kernels::pair_sum_unsaturated(p, q, gates.saturation_dn, sums, squares, &mut self.pairs);
             }
-            sum as f32 / planes.len().max(1) as f32
-        };
-        let (high_count, low_count) = (frames.high.len().max(1) as f32, frames.low.len().max(1) as f32);
-        for x in 0..width {
-            let saturated = &mut self.saturated[x];
-            let mut low_saturated = 0;
-            let high = mean(&frames.high, x, saturated);
-            let low = mean(&frames.low, x, &mut low_saturated);
-            // With both references saturated no modulation is left, as when both frames of a pair are.
-            *saturated |= low_saturated | ((*saturated & low_saturated) >> 1);
-            let mean_sum = pair_sums[x] as f32 / pair_count;
-            let (high, low, modulation, variance) = match frames.levels {
-                Levels::References => {
-                    let variance = gates.variance(high) / high_count + gates.variance(low) / low_count;
-                    (high, low, high - low, variance)
+        } else {
+            let mut count = 0;
+            for axis in &frames.axes {
+                for two in axis.bits.chunks(2) {
+                    count += kernels::pair_sums(two, at, sums, squares);
                 }
-                Levels::HighOnly | Levels::LowOnly => {
-                    let (high, low) = if frames.levels == Levels::HighOnly {
-                        (high, mean_sum - high)
-                    } else {
-                        (mean_sum - low, low)
-                    };
-                    let (known, count) =
-                        if frames.levels == Levels::HighOnly { (high, high_count) } else { (low, low_count) };
-                    // C = +-(2 R - mean sum): the known reference counts twice.
-                    let variance = 4.0 * gates.variance(known) / count
-                        + (gates.variance(high) + gates.variance(low)) / pair_count;
-                    (high, low, high - low, variance)
-                }
-                Levels::Pairs => {
-                    let modulation = pair_differences[x] as f32 / pair_count;
-                    let (high, low) = ((mean_sum + modulation) / 2.0, (mean_sum - modulation) / 2.0);
-                    (high, low, modulation, (gates.variance(high) + gates.variance(low)) / 2.0)
-                }
-            };
-            let pair_variance = gates.variance(high) + gates.variance(low);
-            let sigma = pair_variance.sqrt();
-            self.level_sum[x] = high + low;
-            self.level_variance[x] = variance;
-            self.soft_at[x] = (gates.soft_sigma * sigma).ceil() as i32 - 1;
-            self.inverted[x] = if modulation < 0.0 { u16::MAX } else { 0 };
-            row.modulation[x] = modulation;
-            row.sigma[x] = sigma;
-            // Mode paper knows R_V; its R_H is the mean pair sum less R_V.
-            let dark = if gates.mode == Mode::Paper { mean(&frames.low, x, &mut 0) } else { low };
-            row.dolp[x] = gates.dolp(high + low - dark, dark).clamp(0.0, 1.0);
-            row.intensity[x] = (high.max(low) * (255.0 / gates.full_scale_dn) + 0.5).clamp(0.0, 255.0) as u8;
+            }
+            self.pairs[..len].fill(count);
         }
     }
 
     /// Bit of a pair by its degrees of linear polarization (method, section 3). Where these are equal the bit is lost.
-    fn paper_bit<T: Sample>(&mut self, p: &[T], q: &[T], dark: &[&[T]], y: usize, gates: &Gates) {
-        let width = p.len();
-        for x in 0..width {
-            let dark_sum: i64 = dark.iter().map(|plane| i64::from(plane[y * width + x].dn())).sum();
+    #[inline(always)]
+    fn paper_bit(&mut self, p: &[T], q: &[T], dark: &[&[T]], at: &Range<usize>, gates: &Gates, place: u8) {
+        let (word, soft) = self.bits.place(place);
+        for x in 0..p.len() {
+            let dark_sum: i64 = dark.iter().map(|plane| i64::from(plane[at.start + x].dn())).sum();
             let dark_dn = dark_sum as f32 / dark.len() as f32;
-            let (p, q) = (p[x].dn(), q[x].dn());
-            let difference = gates.dolp(p as f32, dark_dn) - gates.dolp(q as f32, dark_dn);
-            let soft = (p - q).abs() <= self.soft_at[x] || difference == 0.0;
-            self.word[x] = (self.word[x] << 1) | u16::from(difference > 0.0);
-            self.soft[x] = (self.soft[x] << 1) | u16::from(soft);
-            let (p_full, q_full) = (p >= gates.saturation_dn, q >= gates.saturation_dn);
-            self.saturated[x] |= u8::from(p_full | q_full) | (u8::from(p_full & q_full) << 1);
+            let difference = gates.dolp(p[x].dn() as f32, dark_dn) - gates.dolp(q[x].dn() as f32, dark_dn);
+            let near = p[x].max(q[x]).above(p[x].min(q[x])) <= self.soft_at[x];
+            word[x] = word[x].shifted_in(difference > 0.0);
+            soft[x] = soft[x].shifted_in(near || difference == 0.0);
         }
     }
 
     /// Bit of a frame without its partner, against the middle of the references.
-    fn single_bit<T: Sample>(&mut self, plane: &[T], inverse: bool, gates: &Gates) {
+    #[inline(always)]
+    fn single_bit(&mut self, plane: &[T], inverse: bool, gates: &Gates, place: u8) {
+        let (word, soft) = self.bits.place(place);
         for (x, sample) in plane.iter().enumerate() {
-            let dn = sample.dn();
-            let above = 2.0 * dn as f32 - self.level_sum[x];
-            let variance = 4.0 * gates.variance(dn as f32) + self.level_variance[x];
-            let soft = above * above < gates.soft_sigma * gates.soft_sigma * variance;
-            self.word[x] = (self.word[x] << 1) | u16::from((above > 0.0) != inverse);
-            self.soft[x] = (self.soft[x] << 1) | u16::from(soft);
-            self.saturated[x] |= u8::from(dn >= gates.saturation_dn);
+            let dn = sample.dn() as f32;
+            let above = 2.0 * dn - self.level_sum[x];
+            let variance = 4.0 * gates.variance(dn) + self.levels.variance[x];
+            word[x] = word[x].shifted_in((above > 0.0) != inverse);
+            soft[x] = soft[x].shifted_in(above * above < gates.soft_sigma * gates.soft_sigma * variance);
         }
-    }
-
-    /// Words of one axis to values.
-    fn resolve<T>(
-        &mut self,
-        axis: &AxisFrames<'_, T>,
-        index: usize,
-        row: &mut RowMaps<'_>,
-        weak: &mut [f32],
-    ) {
-        let mask = ((1u32 << axis.code.bits) - 1) as u16;
-        for (x, weak) in weak.iter_mut().enumerate() {
-            let word = (self.word[x] ^ self.inverted[x]) & mask;
-            let (value, status) = resolve_word(&axis.values, word, self.soft[x]);
-            row.words[index][x] = word;
-            row.values[index][x] = value;
-            self.status[x] = self.status[x].max(status);
-            if value >= 0 && self.weakest[x] != i32::MAX {
-                let bit = (self.weakest[x] & ((1 << WEAK_BIT_SHIFT) - 1)) as u8;
-                let near = boundary_distance(axis.code, bit, value) <= EDGE_REACH;
-                let key = if near { self.second[x] } else { self.weakest[x] };
-                if key != i32::MAX {
-                    *weak = weak.min((key >> WEAK_BIT_SHIFT) as f32);
-                }
-            }
-        }
-    }
-
-    fn classify<T>(&self, frames: &Frames<'_, T>, gates: &Gates, row: &mut RowMaps<'_>, weak: &[f32]) {
-        let pair_count = frames.pair_count() as f32;
-        for (x, &weak) in weak.iter().enumerate() {
-            let modulation = row.modulation[x].abs();
-            let inverted = self.inverted[x] != 0;
-            let gate = if inverted { 2.0 * gates.lit_sigma } else { gates.lit_sigma };
-            let lit = modulation >= gate * self.level_variance[x].sqrt();
-            let class = if self.saturated[x] & 2 != 0 {
-                Class::Saturated
-            } else if !lit {
-                Class::Unlit
-            } else {
-                match self.status[x] {
-                    Status::Ambiguous => Class::Ambiguous,
-                    Status::Outside => Class::OutOfProjector,
-                    _ if inverted => Class::Inverted,
-                    Status::Edge => Class::Edge,
-                    Status::Clear => Class::Valid,
-                }
-            };
-            row.class[x] = class;
-            row.half_saturated[x] = self.saturated[x] != 0;
-            if !class.is_valid() {
-                for values in &mut row.values {
-                    if let Some(value) = values.get_mut(x) {
-                        *value = -1;
-                    }
-                }
-            }
-            let sigma = row.sigma[x];
-            if class.is_valid()
-                && weak.is_finite()
-                && self.saturated[x] == 0
-                && modulation >= WEAK_JUDGED * sigma
-            {
-                row.weakest[x] = (weak / modulation * WEAK_SCALE).min(254.0) as u8;
-            }
-            if self.pairs[x] > 0 && self.saturated[x] & 4 == 0 {
-                let variance = match frames.levels {
-                    Levels::References => sigma * sigma + self.level_variance[x],
-                    _ => sigma * sigma * (1.0 - 1.0 / pair_count),
-                };
-                row.residual[x] = (self.squares[x] / (self.pairs[x] as f32 * variance)).sqrt();
-            }
-        }
-    }
-}
-
-/// Value of a word (`values` by word, negative outside the projector) with at most one soft bit. A single soft bit is
-/// an edge where both readings are neighbours, of which one may lie just beyond the rim of the projector.
-fn resolve_word(values: &[i32], word: u16, soft: u16) -> (i32, Status) {
-    let read = values[usize::from(word)];
-    if soft == 0 {
-        return (read, if read < 0 { Status::Outside } else { Status::Clear });
-    }
-    let inside = |value: i32| (value >= 0).then_some(value);
-    match soft.count_ones() {
-        1 => {
-            let other = word ^ soft;
-            let neighbours = binary_of_gray(word).abs_diff(binary_of_gray(other)) == 1;
-            match inside(read).or(inside(values[usize::from(other)])) {
-                None => (-1, Status::Outside),
-                Some(value) if neighbours => (value, Status::Edge),
-                Some(_) => (-1, Status::Ambiguous),
-            }
-        }
-        _ => (-1, Status::Ambiguous),
+        // A frame without a partner saturates no pair as a whole.
+        self.peaks.add_single(plane);
     }
 }
 
 /// Whether the known boundaries down to this bit lie far apart.
 fn is_coarse(code: PrefixCode, bit: u8) -> bool {
     u32::from(bit) < u32::from(code.bits) && (1u32 << (code.bits - 1 - bit)) >= COARSE_SPACING
-}
-
-/// Distance in values from the centre of `value` to the next boundary of `bit`, rounded down.
-fn boundary_distance(code: PrefixCode, bit: u8, value: i32) -> i32 {
-    let half = 1i32 << (code.bits - 1 - bit);
-    let within = value & (2 * half - 1);
-    if within < half { half - 1 - within } else { within - half }
-}
-
-#[cfg(test)]
-mod tests {
-    use polscan_patterns::AxisCode;
-
-    use super::*;
-
-    /// All words in order, by reflection.
-    fn words(bits: u8) -> Vec<u16> {
-        (0..bits).fold(vec![0], |list: Vec<u16>, bit| {
-            let again = list.iter().rev().map(|word| word | 1 << bit);
-            list.iter().copied().chain(again).collect()
-        })
-    }
-
-    #[test]
-    fn a_soft_bit_is_an_edge_only_between_neighbours() {
-        let (mut rims, mut strangers) = (0, 0);
-        for size in [1, 2, 3, 5, 12, 17, 100, 768, 1024] {
-            let whole = AxisCode::centred(size).unwrap();
-            for known in 1..=whole.bits() {
-                let code = PrefixCode::new(whole, known);
-                let list = words(known);
-                let inside = |place: usize| code.span(place as i32).is_some();
-                let mut values = vec![-1; list.len()];
-                for place in (0..list.len()).filter(|&place| inside(place)) {
-                    values[usize::from(list[place])] = place as i32;
-                }
-                for (place, &word) in list.iter().enumerate() {
-                    for bit in 0..known {
-                        let other = list.iter().position(|&found| found == word ^ (1 << bit)).unwrap();
-                        let found = resolve_word(&values, word, 1 << bit);
-                        let here = if inside(place) { place } else { other };
-                        let expected = match (inside(place), inside(other)) {
-                            (false, false) => (-1, Status::Outside),
-                            _ if place.abs_diff(other) == 1 => (here as i32, Status::Edge),
-                            _ => (-1, Status::Ambiguous),
-                        };
-                        assert_eq!(found, expected, "{size} px, {known} bits: {word:b} bit {bit}");
-                        if inside(place) != inside(other) {
-                            rims += u32::from(expected.1 == Status::Edge);
-                            strangers += u32::from(expected.1 == Status::Ambiguous);
-                        }
-                    }
-                }
-            }
-        }
-        assert!(rims > 10 && strangers > 10, "{rims} {strangers}");
-    }
 }

@@ -7,8 +7,13 @@ use proptest::prelude::*;
 
 use crate::decode::synth::{normal, random, uniform};
 use crate::decode::{
-    Accumulator, CameraResponse, Class, DecodeSettings, NoiseModel, SharedPlane, Thresholds, limits::Gates,
-    oracle::decode_pixel, plan::plan, sample::Sample, words::decode_pixels,
+    Accumulator, CameraResponse, Class, DecodeSettings, NoiseModel, SharedPlane, Thresholds,
+    limits::Gates,
+    oracle::decode_pixel,
+    plan::plan,
+    sample::Sample,
+    simd::InstructionSet,
+    words::{PixelMaps, decode_pixels},
 };
 
 const WIDTH: usize = 16;
@@ -78,7 +83,8 @@ where
 {
     let planes = shared::<T>(frames);
     let plan = plan::<T>(settings, &planes).map_err(|error| error.to_string())?;
-    let maps = decode_pixels(&plan, &Gates::new(settings, noise));
+    let mut maps = PixelMaps::new(WIDTH * HEIGHT, plan.axes.len());
+    decode_pixels(&plan, &Gates::new(settings, noise), InstructionSet::widest(), &mut maps);
     let mut seen = [0; 12];
     for at in 0..WIDTH * HEIGHT {
         let samples: Vec<(Role, u16)> = frames.iter().map(|(role, frame)| (*role, frame[at])).collect();
