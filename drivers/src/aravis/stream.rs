@@ -40,6 +40,9 @@ const MOST_BUFFERS: usize = 256;
 /// Least room for packets on their way from the network to the library, in bytes.
 const SOCKET_BUFFER: i32 = 1 << 20;
 
+/// What a camera may send with a picture of any size, in bytes.
+const PAYLOAD_SLACK: usize = 1 << 20;
+
 /// Longest that a frame takes from the end of its readout to this machine, less than whoever waits for it is patient for.
 const DELIVERY: Duration = Duration::from_millis(200);
 
@@ -106,6 +109,22 @@ pub struct Running {
     ready: Timestamp,
 }
 
+/// Bytes of a frame as the camera announces them, where they can be meant: what follows the picture is small. A camera
+/// that is just starting may announce anything, and the library ends the program where memory for it cannot be had.
+fn usable_payload(announced: u32, least: usize) -> Result<usize, String> {
+    let announced = announced as usize;
+    if announced < least {
+        return Err(format!("announces frames of {announced} bytes, {least} are needed"));
+    }
+    if announced > 2 * least + PAYLOAD_SLACK {
+        return Err(format!(
+            "announces frames of {announced} bytes where {least} are needed; let it start up or power it off and on, \
+             then try again"
+        ));
+    }
+    Ok(announced)
+}
+
 impl Running {
     /// Starts a stream of `applied` for `frames` frames that go to `arrivals`.
     pub fn start(
@@ -124,13 +143,9 @@ impl Running {
         let camera = features.camera();
         let payload = camera.payload().map_err(|error| failed("reading the size of a frame", error))?;
         let least = applied.wire.bytes(applied.region.width as usize * applied.region.height as usize);
-        if (payload as usize) < least {
-            return Err(DeviceError::BadData {
-                device: device.to_owned(),
-                detail: format!("announces frames of {payload} bytes, {least} are needed"),
-            });
-        }
-        pool.prepare(payload as usize, frames);
+        let payload = usable_payload(payload, least)
+            .map_err(|detail| DeviceError::BadData { device: device.to_owned(), detail })?;
+        pool.prepare(payload, frames);
         let stream = camera.create_stream().map_err(|error| failed("opening the stream", error))?;
         stream.set_emit_signals(false);
         if let Some(stream) = stream.downcast_ref::<GvStream>() {
@@ -297,4 +312,19 @@ impl Running {
 /// A length that a camera gives; none where it is no number.
 fn microseconds(us: f64) -> Duration {
     Duration::try_from_secs_f64(1e-6 * us).unwrap_or_default()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_frame_is_as_large_as_its_picture_and_a_little() {
+        let picture = 1600 * 1200;
+        for usable in [picture, picture + 64, 2 * picture] {
+            assert_eq!(usable_payload(usable as u32, picture), Ok(usable));
+        }
+        assert!(usable_payload(picture as u32 - 1, picture).unwrap_err().contains("1920000 are needed"));
+        assert!(usable_payload(u32::MAX, picture).unwrap_err().contains("power it off and on"));
+    }
 }
