@@ -14,6 +14,7 @@ use super::{
 use crate::{
     camera::Region,
     frame::{PixelStore, Pixels},
+    projector::Slide,
 };
 
 /// Stream of the sensor's own pattern; exposures count from 0 and do not reach it.
@@ -45,7 +46,7 @@ pub(crate) fn full_scale_dn(bits: u8) -> u16 {
     u16::MAX >> (16 - bits)
 }
 
-/// Light and identity of one exposure.
+/// Light and identity of one exposure: all that its frame depends on besides the response.
 #[derive(Debug, Clone)]
 pub(crate) struct Exposure {
     /// Number since the rig was made: what its noise depends on.
@@ -56,6 +57,18 @@ pub(crate) struct Exposure {
     pub(crate) ambient_e: f64,
     /// Whether something has been bumped before it.
     pub(crate) bumped: bool,
+}
+
+impl Exposure {
+    /// Whether the frames of both are the same bit by bit.
+    pub(crate) fn is_same_as(&self, other: &Self) -> bool {
+        let same_light = |(ours, theirs): (&(Arc<Slide>, f64), &(Arc<Slide>, f64))| {
+            ours.1 == theirs.1 && (Arc::ptr_eq(&ours.0, &theirs.0) || ours.0 == theirs.0)
+        };
+        (self.number, self.ambient_e, self.bumped) == (other.number, other.ambient_e, other.bumped)
+            && self.light.len() == other.light.len()
+            && self.light.iter().zip(&other.light).all(same_light)
+    }
 }
 
 /// Renders exposures of one world.

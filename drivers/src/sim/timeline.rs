@@ -24,7 +24,7 @@ struct Change {
 }
 
 /// The pictures of a projector over time.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub(crate) struct Timeline {
     /// Time between refreshes: whole nanoseconds, so that a timeline can be shifted by refreshes without any change.
     period_ns: u64,
