@@ -366,6 +366,7 @@ mod tests {
                 "limit_seconds",
                 "latency_ms",
                 "hold_frames",
+                "synchrony",
                 "retaken",
                 "pair_residual_sigma",
                 "drift",
@@ -397,6 +398,7 @@ mod tests {
             latency_ms: 33.0,
             hold_frames: 2,
             timing_measured: true,
+            synchrony: Some(crate::sequencer::Synchrony::default()),
             ..Default::default()
         }
     }

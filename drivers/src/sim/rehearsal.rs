@@ -1,7 +1,7 @@
 //! Frames of a schedule, rendered before the clock of its scan starts.
 //!
 //! The timeline is played ahead on a copy. A rendered frame is handed out only for an exposure that turns out to be the
-//! very same, light, noise and all, so that a rehearsal can save time but never change a frame.
+//! same, light, noise and all: a rehearsal can save time but never change what a frame shows.
 
 use std::{collections::HashMap, sync::Arc, time::Duration};
 

@@ -9,6 +9,7 @@ use super::{
     noise::Stream,
     panel::{Channels, Illumination, Mixture, Panel, blurred_box, reach_px},
     script::Script,
+    timeline::NEGLIGIBLE_SHARE,
     world::{View, World},
 };
 use crate::{
@@ -60,14 +61,19 @@ pub(crate) struct Exposure {
 }
 
 impl Exposure {
-    /// Whether the frames of both are the same bit by bit.
+    /// Whether the frames of both are the same, but for light that no slide is rendered for anyway.
     pub(crate) fn is_same_as(&self, other: &Self) -> bool {
-        let same_light = |(ours, theirs): (&(Arc<Slide>, f64), &(Arc<Slide>, f64))| {
-            ours.1 == theirs.1 && (Arc::ptr_eq(&ours.0, &theirs.0) || ours.0 == theirs.0)
+        let total: f64 = self.light.iter().map(|(_, weight)| weight).sum();
+        let weight_in = |light: &Mixture, slide: &Arc<Slide>| -> f64 {
+            let of = |(its, _): &&(Arc<Slide>, f64)| Arc::ptr_eq(its, slide) || its == slide;
+            light.iter().filter(of).map(|(_, weight)| weight).sum()
+        };
+        let same_light = |(slide, _): &(Arc<Slide>, f64)| {
+            let difference = weight_in(&self.light, slide) - weight_in(&other.light, slide);
+            difference.abs() <= NEGLIGIBLE_SHARE * total
         };
         (self.number, self.ambient_e, self.bumped) == (other.number, other.ambient_e, other.bumped)
-            && self.light.len() == other.light.len()
-            && self.light.iter().zip(&other.light).all(same_light)
+            && self.light.iter().chain(&other.light).all(same_light)
     }
 }
 

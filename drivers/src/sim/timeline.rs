@@ -13,7 +13,7 @@ use super::{
 use crate::{clock::Timestamp, projector::Slide};
 
 /// Slides with less than this share of an exposure are left out, so that a settled picture is exact.
-const NEGLIGIBLE_SHARE: f64 = 1e-9;
+pub(crate) const NEGLIGIBLE_SHARE: f64 = 1e-9;
 
 /// One change of the picture.
 #[derive(Debug, Clone)]

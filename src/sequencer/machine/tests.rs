@@ -2,6 +2,7 @@ use std::time::Duration;
 
 use polscan_drivers::{
     camera::{AppliedSettings, CameraInfo, CameraSettings, Overlap, PixelFormat, TriggerSource},
+    frame::FrameStamp,
     projector::{ProjectorInfo, ProjectorTiming},
 };
 use polscan_patterns::{Mode, Polarization, ProjectorSize, Sequence};
