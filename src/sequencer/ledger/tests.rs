@@ -32,7 +32,7 @@ fn timing_with(overlap: Option<Overlap>) -> Timing {
         sensor_width: 2,
         sensor_height: 1,
         triggered: true,
-        overlap: overlap,
+        overlap,
     };
     let readout_us = if overlap.is_some() { 6000.0 } else { 0.0 };
     Timing::new(&projector, &camera, 2000.0, readout_us, &PlanOptions::default()).unwrap()

@@ -36,7 +36,7 @@ fn camera(overlap: Option<Overlap>) -> CameraInfo {
         sensor_width: 2,
         sensor_height: 1,
         triggered: true,
-        overlap: overlap,
+        overlap,
     }
 }
 
