@@ -1,6 +1,6 @@
 //! What a capture does next: events in, actions out. No device, no clock, no thread; time is an argument.
 //!
-//! Two things are under way: the slide on the glass (its [`Phase`]) and at most one frame (its [`Flight`]), which belongs
+//! Two things are under way: the slide on the glass (its `Phase`) and at most one frame (its `Flight`), which belongs
 //! to that slide or to the one before.
 //!
 //! ```text
