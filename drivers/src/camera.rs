@@ -143,6 +143,31 @@ pub struct CameraInfo {
     /// Whether [`Camera::trigger`] starts exactly one exposure. A free-running camera answers with the first frame that
     /// was exposed wholly after the call.
     pub triggered: bool,
+    /// Whether the next picture may be flipped while a frame is read out: `None` where the end of an exposure is known
+    /// by the arrival of its frame only.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub overlap: Option<Overlap>,
+}
+
+/// What a camera promises that takes a trigger while it reads out the frame before.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Overlap {
+    /// How much later than [`Camera::trigger`] says an exposure may start.
+    #[serde(rename = "latency_ms", with = "crate::projector::milliseconds")]
+    pub latency: Duration,
+    /// Whether the stamps of frames say when their exposures really began, rather than when they were asked for.
+    pub stamped: bool,
+}
+
+/// The exposures that a capture means to take: the loaded slides from the first to the last, each once.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Schedule {
+    /// Number of slides.
+    pub slides: usize,
+    /// Refreshes from one flip to the next.
+    pub hold_refreshes: u32,
+    /// From flip to the start of exposure.
+    pub trigger_delay: Duration,
 }
 
 /// Counters of a stream since it was armed.
@@ -159,7 +184,7 @@ pub struct StreamStatistics {
     pub counters: BTreeMap<String, u64>,
 }
 
-/// A camera. Calls come in this order, from one thread: `apply`, then any number of rounds of `arm`, pairs of `trigger`
+/// A camera. Calls come in this order, from one thread: `apply`, then any number of rounds of `rehearse`, `arm`, pairs of `trigger`
 /// and `next_frame`, `disarm`. All calls may block up to a stated time; none is called from an async task.
 pub trait Camera: Send {
     /// Identity and abilities.
@@ -174,6 +199,14 @@ pub trait Camera: Send {
     /// Applies all settings and reads each back. Refuses, with all differences, what it cannot honour exactly
     /// (exposure within the camera's own step). Only while disarmed.
     fn apply(&mut self, settings: &CameraSettings) -> Result<AppliedSettings, DeviceError>;
+
+    /// Gets ready for the frames of `schedule`, one by one: called before `arm`, after the slides were loaded, until it
+    /// says that none is left. A device that has nothing to get ready says so at once. What comes otherwise than
+    /// scheduled is delivered all the same.
+    fn rehearse(&mut self, schedule: &Schedule) -> Result<usize, DeviceError> {
+        let _ = schedule;
+        Ok(0)
+    }
 
     /// Prepares buffers and starts the stream; `frames` is how many will be asked for, a hint.
     fn arm(&mut self, frames: usize) -> Result<(), DeviceError>;

@@ -3,6 +3,7 @@
 use std::{
     path::{Path, PathBuf},
     sync::Arc,
+    time::Duration,
 };
 
 use polscan_drivers::{
@@ -199,6 +200,7 @@ fn aravis_options(settings: &Settings) -> aravis::Options {
             UsbMode::Sync => aravis::UsbMode::Sync,
             UsbMode::Async => aravis::UsbMode::Async,
         },
+        trigger_latency: camera.trigger_latency_ms.map(|ms| Duration::from_secs_f64(1e-3 * ms)),
         packet_socket: false,
     }
 }

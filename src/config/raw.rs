@@ -200,6 +200,9 @@ pub struct Camera {
     pub black_level: Option<f64>,
     /// How USB cameras send.
     pub usb_mode: UsbMode,
+    /// How much later than its trigger an exposure starts at the most, where it was measured.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub trigger_latency_ms: Option<f64>,
     /// Exposure time of a camera without a control for it, in microseconds.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub fixed_exposure_us: Option<f64>,

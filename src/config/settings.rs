@@ -177,6 +177,9 @@ fn check_ranges(raw: &Raw, faults: &mut Faults) {
     if raw.camera.fixed_exposure_us.is_some_and(|exposure| !(exposure > 0.0 && exposure.is_finite())) {
         faults.push(("camera.fixed_exposure_us".into(), "an exposure takes more than 0 us".into()));
     }
+    if raw.camera.trigger_latency_ms.is_some_and(|latency| !(0.0..=1000.0).contains(&latency)) {
+        faults.push(("camera.trigger_latency_ms".into(), "must be within 0 and 1000 ms".into()));
+    }
     let size = &raw.projector.size;
     if !(size.is_empty() || size.len() == 2 && size.iter().all(|side| (1..=8192).contains(side))) {
         let message =

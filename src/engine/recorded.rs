@@ -169,6 +169,7 @@ fn summary(sequence: &[Role], capture: &Capture) -> CaptureSummary {
         latency_ms: capture.latency_ms,
         hold_frames: capture.hold_refreshes,
         timing_measured: capture.timing_measured,
+        synchrony: capture.synchrony.clone(),
         retaken: capture.retaken.clone(),
         references_retaken: capture.notes.references_retaken.clone(),
         discarded: capture.notes.discarded.clone(),

@@ -47,10 +47,11 @@ pub fn salvage(spooled: Spooled, reason: Reason, writer: BundleWriter) -> Result
         .iter()
         .map(|captured| captured.frame.stamp.received.since(first.receipt.flipped).as_secs_f64())
         .fold(0.0, f64::max);
-    let Capture { limit_seconds, latency_ms, hold_refreshes, timing_measured, .. } = capture;
+    let Capture { limit_seconds, latency_ms, hold_refreshes, timing_measured, synchrony, .. } = capture;
     let planes: Vec<SharedPlane> = frames.iter().map(|captured| shared_plane(&captured.frame)).collect();
     let count = planes.len() as u64;
     let record = CaptureRecord {
+        synchrony: synchrony.unwrap_or_default().measured(hold_refreshes, &frames),
         frames,
         retaken: Vec::new(),
         seconds,

@@ -18,7 +18,9 @@ use crate::{
     report::{
         self, CaptureSummary, Diagnosis, NamedRegion, Reason, Report, ReportInput, Size, check_regions,
     },
-    sequencer::{CancelFlag, CaptureFailure, CaptureRecord, PartialCapture, Plan, Progress, capture},
+    sequencer::{
+        CancelFlag, CaptureFailure, CaptureRecord, PartialCapture, Plan, Progress, Synchrony, capture,
+    },
     store::{
         BundleWriter, Manifest,
         bundle::FRAMES_FILE_NAME,
@@ -153,7 +155,7 @@ impl Scan {
             camera: response(&applied),
             thresholds: settings.thresholds,
         };
-        let plan = plan(settings, sequence, &projector, applied)?;
+        let plan = plan(settings, sequence, &projector, &camera, applied)?;
         // What no frames can be decoded with is refused before any is captured.
         Accumulator::new(decode.clone()).map_err(|error| setup("decode with these settings", error))?;
         let described = manifest::Rig {
@@ -355,13 +357,14 @@ impl Scan {
 /// What an unfinished capture left, in the form of a finished one.
 fn partial_record(plan: &Plan, partial: PartialCapture) -> CaptureRecord {
     CaptureRecord {
-        frames: partial.frames,
         retaken: partial.retaken,
         seconds: partial.seconds,
         limit_seconds: plan.limit().as_secs_f64(),
         latency_ms: plan.timing.trigger_delay.as_secs_f64() * 1e3,
         hold_refreshes: plan.timing.hold_refreshes,
         timing_measured: plan.timing.measured,
+        synchrony: Synchrony::planned(&plan.timing).measured(plan.timing.hold_refreshes, &partial.frames),
+        frames: partial.frames,
         applied: plan.applied.clone(),
         statistics: partial.statistics.unwrap_or_default(),
         notes: partial.notes,

@@ -35,6 +35,7 @@ pub(super) fn plan(
     settings: &Settings,
     sequence: Sequence,
     projector: &ProjectorInfo,
+    camera: &CameraInfo,
     applied: AppliedSettings,
 ) -> Result<Plan, Failure> {
     let (timing, limits) = (&settings.raw.projector, &settings.raw.capture);
@@ -46,7 +47,7 @@ pub(super) fn plan(
         retakes_total: limits.retakes_per_scan,
         ..PlanOptions::default()
     };
-    Plan::new(sequence, settings.polarization, projector, applied, &options)
+    Plan::new(sequence, settings.polarization, projector, camera, applied, &options)
         .map_err(|error: PlanError| setup("plan the capture", error))
 }
 

@@ -6,7 +6,7 @@ use polscan_calibration::synchrony::{
     BandTiming, Reading, Ripple, Sample, SyncError, Timing as Measured, combine, edge, plateau, ripple,
 };
 use polscan_drivers::{
-    camera::{CameraInfo, CameraSettings},
+    camera::{AppliedSettings, CameraInfo, CameraSettings},
     clock::Timestamp,
     projector::{ProjectorInfo, ProjectorTiming, Slide},
 };
@@ -112,6 +112,7 @@ pub fn measure(
     progress("lamp");
     let ripple = lamp(&mut bench, &bands, exposure_us)?;
     let applied = bench.set(&settings.camera)?;
+    let camera = bench.camera().clone();
     drop(bench);
     let exposure_ms = 1e-3 * exposure_us;
     let (mut timings, mut unseen) = (Vec::new(), Vec::new());
@@ -135,7 +136,7 @@ pub fn measure(
     }
     let timing = combine(&timings, period_ms)
         .ok_or_else(|| Failure::data(OPERATION, "no part of the picture is seen".to_owned()))?;
-    let chosen = choose(&projector, &timing, applied.settings.exposure_us, applied.readout_us)?;
+    let chosen = choose(&projector, &camera, &timing, &applied)?;
     Ok(Synchrony { projector, timing, bands: timings, unseen, curves, ripple, exposure_ms, chosen })
 }
 
@@ -282,12 +283,13 @@ fn lamp(bench: &mut Bench, bands: &[Band], exposure_us: f64) -> Result<Option<Ri
 /// The least delay and hold that are safe with the measured timing.
 fn choose(
     projector: &ProjectorInfo,
+    camera: &CameraInfo,
     timing: &Measured,
-    exposure_us: f64,
-    readout_us: f64,
+    applied: &AppliedSettings,
 ) -> Result<Timing, Failure> {
     let measured = ProjectorInfo { timing: Some(projector_timing(timing)), ..projector.clone() };
-    Timing::new(&measured, exposure_us, readout_us, &PlanOptions::default())
+    let (exposure_us, readout_us) = (applied.settings.exposure_us, applied.readout_us);
+    Timing::new(&measured, camera, exposure_us, readout_us, &PlanOptions::default())
         .map_err(|error| Failure::Setup { operation: "choose the trigger delay", source: Box::new(error) })
 }
 
@@ -310,6 +312,7 @@ mod tests {
             sensor_width: 640,
             sensor_height: 480,
             triggered,
+            overlap: None,
         };
         assert!(refuse_free_running(&camera(true)).is_ok());
         let refused = refuse_free_running(&camera(false)).unwrap_err().to_string();

@@ -269,6 +269,7 @@ fn capture(input: &ReportInput) -> CaptureReport {
         latency_ms: seconds(|capture| capture.latency_ms),
         hold_frames: known.map(|capture| capture.hold_frames),
         timing_measured: known.map(|capture| capture.timing_measured),
+        synchrony: known.and_then(|capture| capture.synchrony.clone()),
         retaken: known.map(|capture| capture.retaken.clone()).unwrap_or_default(),
         references_retaken: known.map(|capture| capture.references_retaken.clone()).unwrap_or_default(),
         discarded: known.map(|capture| capture.discarded.clone()).unwrap_or_default(),
@@ -365,6 +366,7 @@ mod tests {
                 "limit_seconds",
                 "latency_ms",
                 "hold_frames",
+                "synchrony",
                 "retaken",
                 "pair_residual_sigma",
                 "drift",
@@ -396,6 +398,7 @@ mod tests {
             latency_ms: 33.0,
             hold_frames: 2,
             timing_measured: true,
+            synchrony: Some(crate::sequencer::Synchrony::default()),
             ..Default::default()
         }
     }

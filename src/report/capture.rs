@@ -4,7 +4,7 @@ use polscan_drivers::{camera::StreamStatistics, frame::FrameStamp, projector::Pr
 use polscan_patterns::Role;
 use serde::{Deserialize, Serialize};
 
-use crate::sequencer::{CaptureRecord, Finding, ReferenceRetake, Retake};
+use crate::sequencer::{CaptureRecord, Finding, ReferenceRetake, Retake, Synchrony};
 
 /// A capture without its pixels.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
@@ -19,6 +19,9 @@ pub struct CaptureSummary {
     pub hold_frames: u32,
     /// Whether latency and settling were measured (rather than conservative defaults).
     pub timing_measured: bool,
+    /// How flips and exposures kept step, where it was noted.
+    #[serde(default)]
+    pub synchrony: Option<Synchrony>,
     /// Pairs that were captured again.
     pub retaken: Vec<Retake>,
     /// References that were captured again.
@@ -45,6 +48,7 @@ impl From<&CaptureRecord> for CaptureSummary {
             latency_ms: record.latency_ms,
             hold_frames: record.hold_refreshes,
             timing_measured: record.timing_measured,
+            synchrony: Some(record.synchrony.clone()),
             retaken: record.retaken.clone(),
             references_retaken: record.notes.references_retaken.clone(),
             discarded: record.notes.discarded.clone(),
@@ -125,6 +129,7 @@ mod tests {
             latency_ms: 33.0,
             hold_refreshes: 2,
             timing_measured: true,
+            synchrony: Synchrony::default(),
             applied: AppliedSettings {
                 settings: CameraSettings {
                     exposure_us: 2000.0,

@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use super::{Accuracy, Reason, Verdict};
 use crate::{
     decode::{NoiseModel, PairResidual},
-    sequencer::{Finding, ReferenceRetake, Retake},
+    sequencer::{Finding, ReferenceRetake, Retake, Synchrony},
 };
 
 /// Schema of the report.
@@ -126,6 +126,9 @@ pub struct CaptureReport {
     pub hold_frames: Option<u32>,
     /// Whether latency and settling were measured on this projector rather than assumed.
     pub timing_measured: Option<bool>,
+    /// How flips and exposures kept step.
+    #[serde(default)]
+    pub synchrony: Option<Synchrony>,
     /// Pairs that were captured again.
     pub retaken: Vec<Retake>,
     /// References that were captured again.

@@ -26,6 +26,7 @@ use super::{
     machine::{Action, Device, Event, GroupRetake, Machine, Outcome, Subject},
     plan::{Group, Plan},
     record::{CaptureNotes, CaptureRecord, CapturedFrame, Finding, ReferenceRetake, Retake},
+    synchrony::Synchrony,
 };
 
 /// Longest wait between two looks at the cancel flag.
@@ -118,7 +119,7 @@ pub fn capture(
     let roles = &plan.sequence.roles;
     let mut machine = Machine::new(plan, camera.info().triggered);
     let mut rig = Rig { projector, camera, dark: None, armed: true };
-    let prepared = rig.prepare(plan);
+    let prepared = rig.prepare(plan, cancel);
     let mut shell = Shell {
         rig,
         clock,
@@ -127,8 +128,8 @@ pub fn capture(
         progress,
         cancel,
         slots: vec![None; roles.len()],
-        receipt: None,
-        triggered: None,
+        shown: None,
+        exposed: None,
         arrived: None,
         received: 0,
         first_flip: None,
@@ -151,7 +152,7 @@ struct Rig<'a> {
 }
 
 impl Rig<'_> {
-    fn prepare(&mut self, plan: &Plan) -> Result<(), Box<CaptureError>> {
+    fn prepare(&mut self, plan: &Plan, cancel: &CancelFlag) -> Result<(), Box<CaptureError>> {
         let slides: Vec<Slide> = plan
             .sequence
             .roles
@@ -161,6 +162,13 @@ impl Rig<'_> {
         let load = |source| Box::new(CaptureError::Load { slides: slides.len(), source });
         self.projector.load(&slides).map_err(load)?;
         let arm = |source| Box::new(CaptureError::Arm { frames: slides.len(), source });
+        let schedule = plan.schedule();
+        // One call a frame at the most; more would be a device that never gets ready.
+        for _ in 0..slides.len() {
+            if cancel.is_cancelled() || self.camera.rehearse(&schedule).map_err(arm)? == 0 {
+                break;
+            }
+        }
         self.camera.arm(slides.len()).map_err(arm)
     }
 
@@ -194,8 +202,10 @@ struct Shell<'a> {
     progress: &'a mut dyn FnMut(Progress<'_>),
     cancel: &'a CancelFlag,
     slots: Vec<Option<CapturedFrame>>,
-    receipt: Option<PresentReceipt>,
-    triggered: Option<Timestamp>,
+    /// Receipt of the slide that was shown last.
+    shown: Option<PresentReceipt>,
+    /// Receipt and start of the exposure whose frame is awaited.
+    exposed: Option<(PresentReceipt, Timestamp)>,
     arrived: Option<Frame>,
     received: u64,
     first_flip: Option<Timestamp>,
@@ -273,7 +283,7 @@ impl Shell<'_> {
         match self.rig.projector.show(step as u32) {
             Ok(receipt) => {
                 self.first_flip.get_or_insert(receipt.flipped);
-                self.receipt = Some(receipt);
+                self.shown = Some(receipt);
                 Event::Presented(receipt)
             }
             Err(error) => Event::DeviceFailed(Device::Projector, error),
@@ -286,7 +296,7 @@ impl Shell<'_> {
         }
         match self.rig.camera.trigger(at) {
             Ok(started) => {
-                self.triggered = Some(started);
+                self.exposed = self.shown.map(|receipt| (receipt, started));
                 Event::Triggered(started)
             }
             Err(error) => Event::DeviceFailed(Device::Camera, error),
@@ -338,9 +348,7 @@ impl Shell<'_> {
     }
 
     fn keep(&mut self, step: usize) {
-        let (Some(frame), Some(receipt), Some(triggered)) =
-            (self.arrived.take(), self.receipt, self.triggered)
-        else {
+        let (Some(frame), Some((receipt, triggered))) = (self.arrived.take(), self.exposed) else {
             return;
         };
         self.last_frame = self.last_frame.max(Some(frame.stamp.received));
@@ -473,10 +481,12 @@ impl Shell<'_> {
             frames.iter().map(|captured| captured.triggered.since(captured.receipt.flipped).as_secs_f64());
         let latency_ms = delays.sum::<f64>() * 1e3 / frames.len().max(1) as f64;
         CaptureRecord {
-            frames,
             retaken,
             seconds,
             limit_seconds: self.plan.limit().as_secs_f64(),
+            synchrony: Synchrony::planned(&self.plan.timing)
+                .measured(self.plan.timing.hold_refreshes, &frames),
+            frames,
             latency_ms,
             hold_refreshes: self.plan.timing.hold_refreshes,
             timing_measured: self.plan.timing.measured,

@@ -105,6 +105,8 @@ pub(super) struct Window {
     pub at: Timestamp,
     /// Start that the camera announced.
     pub started: Timestamp,
+    /// When the light of the next picture can come, where that is asked for before the frame is in hand.
+    pub next_light: Option<Timestamp>,
 }
 
 /// The exposures so far.
@@ -152,7 +154,7 @@ impl Exposures {
     /// Order of the checks: the camera's own count (repeated, out of order), the time of the exposure, the driver's
     /// belief, then whether frames are missing in front of it.
     pub fn enter(&mut self, timing: &Timing, window: Window, stamp: &FrameStamp) -> Result<(), Refusal> {
-        let FrameStamp { frame_id, trigger, exposure_start, .. } = *stamp;
+        let FrameStamp { frame_id, trigger, exposure_start, received, .. } = *stamp;
         if frame_id + 1 == self.next_id {
             return Err(Refusal::passing("duplicate-frame", format!("frame {frame_id} came again")));
         }
@@ -176,6 +178,17 @@ impl Exposures {
         if self.one_each && exposure_start > latest {
             let late = exposure_start.since(latest);
             let evidence = format!("frame {frame_id} was exposed {late:.1?} after its trigger");
+            return Err(Refusal::new("late-frame", evidence));
+        }
+        // Where a stamp only repeats when the exposure was asked for, the arrival has to prove when it was over.
+        if let Some(light) = window.next_light
+            && !timing.stamped
+            && received > light + timing.readout
+        {
+            let late = received.since(light + timing.readout);
+            let evidence = format!(
+                "frame {frame_id} arrived {late:.1?} too late to be certain that the next picture is not in it"
+            );
             return Err(Refusal::new("late-frame", evidence));
         }
         // A driver that numbers frames by counting them falls behind by one with each lost frame.

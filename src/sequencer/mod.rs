@@ -9,6 +9,7 @@ mod ledger;
 pub mod machine;
 pub mod plan;
 mod record;
+mod synchrony;
 
 pub use capture::{CancelFlag, Progress, capture, slide};
 pub use failure::{CaptureError, CaptureFailure, PartialCapture};
@@ -19,3 +20,4 @@ pub use judge::{
 };
 pub use plan::{Plan, PlanError, PlanOptions};
 pub use record::{CaptureNotes, CaptureRecord, CapturedFrame, Finding, ReferenceRetake, Retake};
+pub use synchrony::{PhaseError, Synchrony};

@@ -1,27 +1,17 @@
-//! When each slide is shown and each exposure starts. Pure: durations in, a timetable out.
-//!
-//! One slide is in flight at a time. Seen from its flip:
-//!
-//! ```text
-//! flip    latency      settling    margin  exposure   readout   lead   next flip
-//! |-----------------|------------|--|===============|----------|------|
-//! |    old light    |   mixture  |       stable light               (latency) ... until the next slide's light
-//! |------------------------- hold_refreshes x refresh_period -----------------|
-//! ```
-//!
-//! The frame is in hand before the next slide is asked for, so that an exposure cannot reach into the next picture
-//! even where the camera is slower than it says: the scan then takes longer, no more. Judging a pair overlaps the
-//! latency of the slide after it.
+//! What a capture does, known before its first flip. Pure: what the devices say of themselves in, a plan out.
+
+mod timing;
 
 use std::time::Duration;
 
 use polscan_drivers::{
-    camera::AppliedSettings,
-    clock::Timestamp,
-    projector::{PresentReceipt, ProjectorInfo, ReceiptMethod},
+    camera::{AppliedSettings, CameraInfo, Schedule},
+    projector::ProjectorInfo,
 };
 use polscan_patterns::{Axis, Polarization, PolarizationError, ProjectorSize, Role, Sequence};
 use thiserror::Error;
+
+pub use timing::{Order, Timing};
 
 /// Refreshes from flip to first light that are assumed of an unmeasured projector: signal processing of common
 /// projectors takes one to three.
@@ -30,15 +20,12 @@ pub const ASSUMED_LATENCY_REFRESHES: u32 = 3;
 /// Settling that is assumed of an unmeasured projector, besides the refresh that scan-out takes from top to bottom.
 pub const ASSUMED_SETTLING: Duration = Duration::from_millis(20);
 
-/// Refreshes by which a flip may follow a receipt that was only [guessed](ReceiptMethod::Guessed): a swapchain holds
+/// Refreshes by which a flip may follow a receipt that was only [guessed](polscan_drivers::projector::ReceiptMethod::Guessed): a swapchain holds
 /// that many pictures back.
 pub const GUESSED_FLIP_REFRESHES: u32 = 2;
 
 /// Most refreshes that a slide may be held: two minutes at 60 Hz.
 pub const MAX_HOLD_REFRESHES: u32 = 7200;
-
-/// Longest time that is planned with, so that sums cannot overflow.
-const LONGEST: Duration = Duration::from_secs(3600);
 
 /// What the configuration can say about a capture.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -115,9 +102,9 @@ pub enum PlanError {
         /// Least delay.
         needed: Duration,
     },
-    /// The configured hold is shorter than delay, exposure and readout.
+    /// The configured hold is shorter than delay, exposure and what must follow.
     #[error(
-        "a hold of {hold} refreshes is too short: delay, exposure and readout need {needed}; raise it, or leave it out"
+        "a hold of {hold} refreshes is too short: delay, exposure and what follows need {needed}; raise it, or leave it out"
     )]
     ShortHold {
         /// Configured hold.
@@ -128,156 +115,6 @@ pub enum PlanError {
     /// The channels cannot carry the code.
     #[error("the projector's channels cannot carry a polarization code")]
     Polarization(#[source] PolarizationError),
-}
-
-/// Timetable of one slide, the same for all.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Timing {
-    /// Time between refreshes.
-    pub refresh_period: Duration,
-    /// From flip to first light.
-    pub latency: Duration,
-    /// From first light to a settled picture.
-    pub settling: Duration,
-    /// Whether latency and settling were measured (rather than assumed).
-    pub measured: bool,
-    /// From flip to the start of exposure.
-    pub trigger_delay: Duration,
-    /// Exposure time.
-    pub exposure: Duration,
-    /// From the end of exposure until the frame has arrived.
-    pub readout: Duration,
-    /// Refreshes that each slide is held.
-    pub hold_refreshes: u32,
-    /// How far a frame's stamp may be off.
-    pub stamp_tolerance: Duration,
-    /// How much later than computed a frame may arrive.
-    pub frame_slack: Duration,
-}
-
-impl Timing {
-    /// The timetable with the least safe hold, or the configured one where it is safe.
-    pub fn new(
-        projector: &ProjectorInfo,
-        exposure_us: f64,
-        readout_us: f64,
-        options: &PlanOptions,
-    ) -> Result<Self, PlanError> {
-        let refresh_period = projector.refresh_period;
-        if refresh_period.is_zero() || refresh_period > Duration::from_secs(1) {
-            return Err(PlanError::Value {
-                what: "a refresh period",
-                value: format!("{refresh_period:?}"),
-                expected: "more than 0 and at most 1 s",
-            });
-        }
-        let exposure = microseconds("an exposure", exposure_us)?;
-        if exposure.is_zero() {
-            let value = format!("{exposure_us} us");
-            return Err(PlanError::Value { what: "an exposure", value, expected: "more than 0" });
-        }
-        let readout = microseconds("a readout", readout_us)?;
-        let (latency, settling) = match projector.timing {
-            Some(timing) => (timing.latency, timing.settling),
-            None => (refresh_period * ASSUMED_LATENCY_REFRESHES, refresh_period + ASSUMED_SETTLING),
-        };
-        for (what, time) in [
-            ("a latency", latency),
-            ("a settling", settling),
-            ("a trigger delay", options.trigger_delay.unwrap_or_default()),
-            ("a margin", options.margin),
-            ("a stamp tolerance", options.stamp_tolerance),
-            ("a submit lead", options.submit_lead),
-            ("a frame slack", options.frame_slack),
-        ] {
-            if time > LONGEST {
-                return Err(PlanError::Value { what, value: format!("{time:?}"), expected: "at most 1 h" });
-            }
-        }
-        let margin = options.margin.max(options.stamp_tolerance);
-        let needed = latency + settling + margin;
-        let trigger_delay = match options.trigger_delay {
-            // Against a measured projector the delay is checked; otherwise it is all that is known of it.
-            Some(delay) if projector.timing.is_some() && delay < needed => {
-                return Err(PlanError::EarlyTrigger { delay, needed });
-            }
-            Some(delay) => delay,
-            None => needed,
-        };
-        let busy = trigger_delay + exposure + readout + options.submit_lead;
-        let least_hold = busy.as_nanos().div_ceil(refresh_period.as_nanos()).max(1);
-        let too_long = || PlanError::Value {
-            what: "a hold",
-            value: format!("{} refreshes", u128::from(options.hold_refreshes.unwrap_or(0)).max(least_hold)),
-            expected: "at most 7200",
-        };
-        let least_hold = u32::try_from(least_hold).map_err(|_| too_long())?;
-        let hold_refreshes = options.hold_refreshes.unwrap_or(least_hold);
-        if least_hold.max(hold_refreshes) > MAX_HOLD_REFRESHES {
-            return Err(too_long());
-        }
-        if hold_refreshes < least_hold {
-            return Err(PlanError::ShortHold { hold: hold_refreshes, needed: least_hold });
-        }
-        Ok(Self {
-            refresh_period,
-            latency,
-            settling,
-            measured: projector.timing.is_some(),
-            trigger_delay,
-            exposure,
-            readout,
-            hold_refreshes,
-            stamp_tolerance: options.stamp_tolerance,
-            frame_slack: options.frame_slack,
-        })
-    }
-
-    /// How long each slide is held.
-    pub fn hold(&self) -> Duration {
-        self.refresh_period * self.hold_refreshes
-    }
-
-    /// The latest moment at which the slide of `receipt` may have been flipped.
-    pub fn latest_flip(&self, receipt: &PresentReceipt) -> Timestamp {
-        match receipt.method {
-            ReceiptMethod::Guessed => receipt.flipped + self.refresh_period * GUESSED_FLIP_REFRESHES,
-            _ => receipt.flipped,
-        }
-    }
-
-    /// When to start the exposure of a slide flipped at `flip`. Where that has passed, whole refreshes later: a
-    /// constant phase to the refresh keeps a pulsed lamp and the panel's frame inversion out of the comparison of
-    /// frames.
-    pub fn trigger_at(&self, flip: Timestamp, now: Timestamp) -> Timestamp {
-        let at = flip + self.trigger_delay;
-        let late = now.since(at).as_nanos().div_ceil(self.refresh_period.as_nanos()) as u64;
-        Timestamp(at.0 + late * self.refresh_period.as_nanos() as u64)
-    }
-
-    /// When to ask for the slide after the one flipped at `flip`: a quarter into the refresh before its own, safe from
-    /// jitter to both sides.
-    pub fn next_show(&self, flip: Timestamp) -> Timestamp {
-        flip + self.refresh_period * (self.hold_refreshes - 1) + self.refresh_period / 4
-    }
-
-    /// When the frame of an exposure that began at `started` counts as lost.
-    pub fn frame_deadline(&self, started: Timestamp) -> Timestamp {
-        started + self.exposure + self.readout + self.frame_slack
-    }
-
-    /// When the light can change that the slide after the one flipped at `flip` brings, where that is flipped in time.
-    /// The latency shields the exposure only where it was measured.
-    pub fn next_light(&self, flip: Timestamp) -> Timestamp {
-        flip + self.hold() + if self.measured { self.latency } else { Duration::ZERO }
-    }
-}
-
-fn microseconds(what: &'static str, value_us: f64) -> Result<Duration, PlanError> {
-    Duration::try_from_secs_f64(value_us * 1e-6)
-        .ok()
-        .filter(|time| *time <= LONGEST)
-        .ok_or_else(|| PlanError::Value { what, value: format!("{value_us} us"), expected: "0 us to 1 h" })
 }
 
 /// Steps that are taken, judged and if need be repeated together.
@@ -341,6 +178,7 @@ impl Plan {
         sequence: Sequence,
         polarization: Polarization,
         projector: &ProjectorInfo,
+        camera: &CameraInfo,
         applied: AppliedSettings,
         options: &PlanOptions,
     ) -> Result<Self, PlanError> {
@@ -356,7 +194,8 @@ impl Plan {
         if sequence.mode.is_polarized() {
             polarization.validate().map_err(PlanError::Polarization)?;
         }
-        let timing = Timing::new(projector, applied.settings.exposure_us, applied.readout_us, options)?;
+        let (exposure_us, readout_us) = (applied.settings.exposure_us, applied.readout_us);
+        let timing = Timing::new(projector, camera, exposure_us, readout_us, options)?;
         Ok(Self {
             groups: groups(&sequence.roles),
             sequence,
@@ -366,6 +205,15 @@ impl Plan {
             retakes_each: options.retakes_each,
             retakes_total: options.retakes_total,
         })
+    }
+
+    /// What is asked of the devices where nothing is repeated.
+    pub fn schedule(&self) -> Schedule {
+        Schedule {
+            slides: self.sequence.roles.len(),
+            hold_refreshes: self.timing.hold_refreshes,
+            trigger_delay: self.timing.trigger_delay,
+        }
     }
 
     /// What the display allows at least: frames x hold.

@@ -9,6 +9,8 @@ use polscan_drivers::{
 use polscan_patterns::{Axis, Role};
 use serde::{Deserialize, Serialize};
 
+use super::synchrony::Synchrony;
+
 /// One frame with the evidence of what was on the glass.
 #[derive(Debug, Clone)]
 pub struct CapturedFrame {
@@ -92,6 +94,8 @@ pub struct CaptureRecord {
     pub hold_refreshes: u32,
     /// Whether latency and settling were measured (rather than conservative defaults).
     pub timing_measured: bool,
+    /// How flips and exposures kept step.
+    pub synchrony: Synchrony,
     /// Camera settings in effect.
     pub applied: AppliedSettings,
     /// Counters of the camera's stream.

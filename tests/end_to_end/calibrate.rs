@@ -114,7 +114,21 @@ fn timing_of_the_projector_is_found_and_used_where_the_driver_states_none() {
     rig = rig.set("rig.sync", "sync-2/sync.toml");
     rig.scan("measured", &[]).expect(0);
     let hold = |out: &str| rig.report(out)["capture"]["hold_frames"].as_u64().unwrap();
-    assert!(hold("measured") < hold("unknown"), "{} {}", hold("measured"), hold("unknown"));
+    assert_eq!((hold("measured"), hold("unknown")), (4, 6));
+    // The scan waits for what was measured, and is as much shorter.
+    let capture = |out: &str| rig.report(out)["capture"].clone();
+    let (measured, unknown) = (capture("measured"), capture("unknown"));
+    assert_eq!((&measured["timing_measured"], &unknown["timing_measured"]), (&true.into(), &false.into()));
+    let file = table(&rig, "sync-2/sync.toml");
+    for (ours, theirs) in
+        [("projector_latency_ms", "timing.latency_ms"), ("projector_settling_ms", "timing.settling_ms")]
+    {
+        let planned = measured["synchrony"][ours].as_f64().expect("a time");
+        assert!((planned - number(&file, theirs)).abs() < 1e-3, "{ours}: {measured}");
+    }
+    let [short_s, long_s] = [&measured, &unknown].map(|capture| capture["seconds"].as_f64().expect("a time"));
+    assert!(short_s < 0.7 * long_s, "{short_s} s of {long_s} s");
+    assert_eq!(measured["synchrony"]["idle_refreshes"], 0);
     let refused = rig.set("sim.projector.refresh_hz", 50.0).scan("other", &[]).expect(64);
     assert!(refused.stderr.contains("60.00 Hz") && refused.stderr.contains("rig.sync"), "{}", refused.stderr);
 }

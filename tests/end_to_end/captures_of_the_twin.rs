@@ -64,6 +64,48 @@ fn a_scan_repeats_bit_by_bit_and_in_real_time() {
     assert!(compared.is_some(), "no frame of six scans was on time");
 }
 
+/// On a virtual clock nothing is late, so that the pace is exact: not one refresh is idle.
+#[test]
+fn a_scan_takes_its_holds_and_the_last_frame_s_own_way_and_no_more() {
+    let rig = Rig::small();
+    rig.scan("scan", &[]).expect(0);
+    let report = rig.report("scan");
+    let capture = &report["capture"];
+    let number = |key: &str| capture[key].as_f64().unwrap_or_else(|| panic!("{key}: {capture}"));
+    let synchrony = &capture["synchrony"];
+    assert_eq!(synchrony["order"], "overlapped", "{synchrony}");
+    assert_eq!(synchrony["idle_refreshes"], 0, "{synchrony}");
+    assert!(synchrony["phase_error_us"]["worst"].as_f64().expect("a phase error") < 0.01, "{synchrony}");
+    let frames = report["frames"].as_f64().expect("frames");
+    let hold_s = number("hold_frames") * 1e-3 * synchrony["refresh_period_ms"].as_f64().expect("a period");
+    // Exposure 2 ms, readout 6.1 ms.
+    let own_s = 1e-3 * (synchrony["trigger_delay_ms"].as_f64().expect("a delay") + 2.0 + 6.1);
+    let expected_s = (frames - 1.0) * hold_s + own_s;
+    assert!((number("seconds") - expected_s).abs() < 1e-6, "{} s, not {expected_s} s", number("seconds"));
+    let manifest = json(&rig.path("scan").join("manifest.json"));
+    for frame in manifest["capture"]["frames"].as_array().expect("evidence") {
+        assert!(frame["phase_error_us"].as_f64().expect("of each frame").abs() < 0.01, "{frame}");
+    }
+}
+
+/// How near a scan in real time comes to that depends on what else the machine does: printed, and held loosely.
+#[test]
+fn a_scan_in_real_time_keeps_the_pace_as_far_as_the_machine_does() {
+    let rig = Rig::small().set("sim.pacing", "real-time");
+    rig.scan("scan", &["--mode", "fast"]).expect(0);
+    let capture = &rig.report("scan")["capture"];
+    let number = |key: &str| capture[key].as_f64().unwrap_or_else(|| panic!("{key}: {capture}"));
+    let ratio = number("seconds") / number("limit_seconds");
+    let manifest = json(&rig.path("scan").join("manifest.json"));
+    let rehearsed = &manifest["capture"]["statistics"]["counters"]["rehearsed_frames"];
+    println!(
+        "capture.seconds / capture.limit_seconds: {ratio:.3}, {rehearsed} frames rendered in advance, {}",
+        capture["synchrony"]
+    );
+    assert!(rehearsed.as_u64().is_some_and(|frames| frames > 0), "no frame was rendered in advance");
+    assert!((0.9..10.0).contains(&ratio), "{ratio} times the display's own pace");
+}
+
 /// Compares the frames that both scans exposed as the same exposure at the same time after its flip; returns how many.
 fn same_exposures(rig: &Rig, out: &str, other: &Rig, other_out: &str) -> usize {
     let (ours, theirs) = (exposures(rig, out), exposures(other, other_out));

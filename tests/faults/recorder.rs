@@ -32,7 +32,8 @@ pub fn record(rig: &Rig, mode: Option<&str>, out: &str) {
             .then_some(settings.raw.projector.hold_refreshes),
         ..PlanOptions::default()
     };
-    let plan = Plan::new(sequence.clone(), settings.polarization, &info, applied.clone(), &options)
+    let camera = devices.camera.info().clone();
+    let plan = Plan::new(sequence.clone(), settings.polarization, &info, &camera, applied.clone(), &options)
         .expect("a timetable");
     let slides: Vec<_> =
         sequence.roles.iter().map(|&role| slide(sequence.raster(role, settings.polarization))).collect();

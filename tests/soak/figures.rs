@@ -1,5 +1,5 @@
 //! What the service costs: the time to the first pattern, the overhead over `polscan scan`, and how soon it answers
-//! while it decodes.
+//! while it decodes. And how near a capture comes to the pace of its display.
 
 use std::{
     sync::atomic::{AtomicBool, Ordering},
@@ -73,6 +73,34 @@ fn figures_of_the_first_pattern() {
     say("request until its answer", asked.iter().map(|asked| ms(*asked)).collect());
     say("accepted until the first pattern is shown", shown);
     say("request until the first pattern is shown, at most", sum);
+    describe("after");
+}
+
+/// How near scans of the whole rig come to the pace of their display, in real time.
+#[test]
+fn figures_of_the_pace() {
+    describe("before");
+    let rig = Rig::scaled(1.0).set("sim.pacing", "real-time");
+    let mut ratios = Vec::new();
+    for number in 0..PAIRS {
+        let out = format!("out-{number}");
+        rig.scan(&out, &[]).expect(0);
+        let report = rig.report(&out);
+        let capture = &report["capture"];
+        let seconds = |key: &str| capture[key].as_f64().expect("a time");
+        ratios.push(seconds("seconds") / seconds("limit_seconds"));
+        println!(
+            "{:.3} s of {:.3} s, idle refreshes {}, phase error {} us",
+            seconds("seconds"),
+            seconds("limit_seconds"),
+            capture["synchrony"]["idle_refreshes"],
+            capture["synchrony"]["phase_error_us"]
+        );
+        std::fs::remove_dir_all(rig.path(&out)).expect("the bundle is removed");
+    }
+    ratios.sort_by(f64::total_cmp);
+    let [half, last] = [quantile(&ratios, 0.5), ratios[ratios.len() - 1]];
+    println!("capture.seconds / capture.limit_seconds: median {half:.3}, largest {last:.3} of {PAIRS}");
     describe("after");
 }
 

@@ -21,7 +21,7 @@ use super::{
     stream::{Pool, Running},
 };
 use crate::{
-    camera::{AppliedSettings, CameraInfo, CameraSettings, StreamStatistics, TriggerSource},
+    camera::{AppliedSettings, CameraInfo, CameraSettings, Overlap, StreamStatistics, TriggerSource},
     clock::{Clock, Timestamp},
     error::DeviceError,
     frame::Frame,
@@ -98,7 +98,7 @@ impl Actor {
         features.device().connect_control_lost(move |_| {
             let _ = sender.send(());
         });
-        let info = info(&features, device);
+        let info = info(&features, device, &options);
         let actor = Self {
             running: None,
             features: Some(features),
@@ -326,7 +326,16 @@ fn usb_mode(asked: UsbMode, version: [u32; 3]) -> Result<aravis::UvUsbMode, Stri
     }
 }
 
-fn info(features: &Features, device: &str) -> CameraInfo {
+/// Only where the camera takes triggers while it reads out, and must, and somebody has measured how late it exposes.
+fn overlap(features: &Features, options: &Options) -> Option<Overlap> {
+    let must = !options.allow.iter().any(|setting| setting == "trigger_overlap");
+    let can = features.has("TriggerOverlap")
+        && features.entries("TriggerOverlap").iter().any(|entry| entry == "ReadOut");
+    // Stamps are the times of trigger commands.
+    options.trigger_latency.filter(|_| must && can).map(|latency| Overlap { latency, stamped: false })
+}
+
+fn info(features: &Features, device: &str, options: &Options) -> CameraInfo {
     let camera = features.camera();
     let text = |text: Result<aravis::glib::GString, aravis::glib::Error>| {
         text.map(|text| text.trim().to_owned()).unwrap_or_default()
@@ -344,6 +353,7 @@ fn info(features: &Features, device: &str) -> CameraInfo {
         sensor_width: width.max(0) as u32,
         sensor_height: height.max(0) as u32,
         triggered: true,
+        overlap: overlap(features, options),
     }
 }
 

@@ -1,5 +1,7 @@
 //! What a user can say about a camera beyond the settings that every camera has.
 
+use std::time::Duration;
+
 /// How bulk data of a USB camera is received.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum UsbMode {
@@ -21,6 +23,8 @@ pub struct Options {
     pub black_level: Option<f64>,
     /// How USB cameras send.
     pub usb_mode: UsbMode,
+    /// How much later than its trigger command an exposure starts at the most, where it was measured.
+    pub trigger_latency: Option<Duration>,
     /// Whether frames of GigE cameras are taken by a packet socket where the process may open one. It loses less, but
     /// until the library has set its filter it sees what passes on any network: such a packet is then taken for a frame
     /// whose number all frames of the stream are too old for.

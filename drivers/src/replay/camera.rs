@@ -40,6 +40,8 @@ impl CameraDriver for ReplayCameras {
             sensor_width: region.x + region.width,
             sensor_height: region.y + region.height,
             triggered: true,
+            // Times of a recording are made up, so that there is nothing to be gained.
+            overlap: None,
         };
         Ok(Box::new(ReplayCamera { shared: self.shared.clone(), info, applied: false, stream: None }))
     }

@@ -4,15 +4,17 @@ use std::{collections::VecDeque, sync::Arc, time::Duration};
 
 use super::{
     description::{CameraDescription, Pacing},
+    rehearsal,
     render::{Exposure, Response, full_scale_dn},
     rig::{Device, Shared, Taken},
     script::Delivered,
+    timeline::Timeline,
     worker::{Delivery, Job, Worker},
 };
 use crate::{
     camera::{
-        AppliedSettings, Camera, CameraDriver, CameraInfo, CameraNoise, CameraSettings, Listing, PixelFormat,
-        Region, StreamStatistics, TriggerSource,
+        AppliedSettings, Camera, CameraDriver, CameraInfo, CameraNoise, CameraSettings, Listing, Overlap,
+        PixelFormat, Region, Schedule, StreamStatistics, TriggerSource,
     },
     clock::Timestamp,
     error::DeviceError,
@@ -61,6 +63,7 @@ impl CameraDriver for SimCameras {
             sensor_width,
             sensor_height,
             triggered: true,
+            overlap: Some(Overlap { latency: Duration::ZERO, stamped: true }),
         };
         Ok(Box::new(SimCamera { taken, info, applied: None, stream: None }))
     }
@@ -262,6 +265,20 @@ impl Camera for SimCamera {
         Ok(applied)
     }
 
+    fn rehearse(&mut self, schedule: &Schedule) -> Result<usize, DeviceError> {
+        if self.stream.is_some() {
+            return Err(self.out_of_order("rehearse", "armed"));
+        }
+        let Some((_, response)) = &self.applied else {
+            return Err(self.out_of_order("rehearse", "no settings are applied"));
+        };
+        // A virtual clock waits for each frame.
+        if self.shared().description.pacing == Pacing::Fast {
+            return Ok(0);
+        }
+        Ok(rehearsal::step(self.shared(), response, schedule))
+    }
+
     fn arm(&mut self, _frames: usize) -> Result<(), DeviceError> {
         if self.stream.is_some() {
             return Err(self.out_of_order("arm", "armed"));
@@ -346,7 +363,8 @@ impl Camera for SimCamera {
     }
 
     fn disarm(&mut self) -> Result<StreamStatistics, DeviceError> {
-        let Some(stream) = self.stream.take() else {
+        let rehearsal = self.taken.shared.rehearsed().take();
+        let Some(mut stream) = self.stream.take() else {
             return Err(self.out_of_order("disarm", "not armed"));
         };
         let left = match stream.pending {
@@ -355,6 +373,9 @@ impl Camera for SimCamera {
         };
         let mut timeline = self.taken.shared.timeline();
         left.iter().for_each(|job| timeline.dismiss(job.number));
+        if let Some(rehearsal) = rehearsal {
+            stream.statistics.counters.insert("rehearsed_frames".to_owned(), rehearsal.used());
+        }
         Ok(stream.statistics)
     }
 }
@@ -389,22 +410,36 @@ fn next_virtual(
 pub(crate) fn expose(shared: &Shared, response: &Response, job: &Job) -> Arc<dyn PixelStore> {
     let exposure = {
         let mut timeline = shared.timeline();
-        let light = timeline.mixture(job.start, job.end);
+        let exposure = light(shared, &timeline, job.number, [job.start, job.end]);
         timeline.dismiss(job.number);
-        let middle = Timestamp(job.start.0 + (job.end.0 - job.start.0) / 2);
-        let since_ns = timeline.since_armed_ns(middle);
-        let ambient_e = shared.script.ambient_e(since_ns, shared.description.ambient.electrons);
-        let bumped = shared.script.bump().is_some_and(|(at_ns, _)| since_ns >= at_ns as f64);
-        Exposure { number: job.number, light, ambient_e, bumped }
+        exposure
     };
     if shared.script.auto_exposure().is_none() {
-        return shared.renderer.render(&exposure, response);
+        let rehearsed = shared.rehearsed().as_mut().and_then(|rehearsal| rehearsal.take(&exposure, response));
+        return rehearsed.unwrap_or_else(|| shared.renderer.render(&exposure, response));
     }
     let exposure_us = 1e6 * job.end.since(job.start).as_secs_f64();
     let store = shared.renderer.render(&exposure, &Response { exposure_us, ..response.clone() });
     let full_scale = f64::from(response.full_scale_dn());
     shared.meter((mean_dn(store.pixels()) - response.black_dn) / (full_scale - response.black_dn));
     store
+}
+
+/// What reaches the sensor in the exposure `number` from one time to the other.
+pub(crate) fn light(
+    shared: &Shared,
+    timeline: &Timeline,
+    number: u64,
+    [start, end]: [Timestamp; 2],
+) -> Exposure {
+    let middle = Timestamp(start.0 + (end.0 - start.0) / 2);
+    let since_ns = timeline.since_armed_ns(middle);
+    Exposure {
+        number,
+        light: timeline.mixture(start, end),
+        ambient_e: shared.script.ambient_e(since_ns, shared.description.ambient.electrons),
+        bumped: shared.script.bump().is_some_and(|(at_ns, _)| since_ns >= at_ns as f64),
+    }
 }
 
 /// Mean of some ten thousand samples.

@@ -20,6 +20,12 @@
 //! regions or the time of day. A fresh rig therefore repeats a scan bit by bit, and a second take on the same rig differs
 //! from the first.
 //!
+//! In real time a frame must not come later than its camera would send it, only because a computer paints it: the frames
+//! of a scan are rendered before its clock starts (`rehearsal.rs`), for its timetable and with the faults of the
+//! description, up to [`REHEARSED_BYTES`]. What is exposed otherwise than scheduled (a re-take and all after it, a flip
+//! or a trigger that came late, a lamp that flickers or drifts, light that changes at a set time, automatic exposure) is
+//! rendered when it is needed, and is then as late as that takes.
+//!
 //! A rig simulates devices that behave, unless its description lists faults ([`FaultDescription`]). Each then happens at
 //! its own place: those of the display between a request and the timeline (`projector.rs`, `timeline.rs`), of the camera
 //! at the sensor (`render.rs`) or between a rendered exposure and its delivery (`camera.rs`), of the scene by a second
@@ -35,6 +41,7 @@ mod polarization;
 mod print;
 mod projection;
 mod projector;
+mod rehearsal;
 mod render;
 mod rig;
 mod scene;
@@ -54,6 +61,7 @@ pub use description::{
 pub use print::Print;
 pub use projection::Projection;
 pub use projector::SimProjectors;
+pub use rehearsal::REHEARSED_BYTES;
 pub use rig::{Rig, RigError, Truth, TruthObject};
 pub use scene::{Material, Object, Plane, Scene, Shape, Sphere, Step, VGroove, Wedge};
 pub use script::FaultDescription;

@@ -98,7 +98,9 @@ impl Projector for SimProjector {
         for (number, slide) in slides.iter().enumerate() {
             check_slide(&self.info, number, slide)?;
         }
-        self.slides = Some(slides.iter().cloned().map(Arc::new).collect());
+        let slides: Vec<Arc<Slide>> = slides.iter().cloned().map(Arc::new).collect();
+        self.taken.shared.set_loaded(slides.clone());
+        self.slides = Some(slides);
         Ok(())
     }
 

@@ -9,11 +9,13 @@ use super::{
     noise::Stream,
     panel::{Channels, Illumination, Mixture, Panel, blurred_box, reach_px},
     script::Script,
+    timeline::NEGLIGIBLE_SHARE,
     world::{View, World},
 };
 use crate::{
     camera::Region,
     frame::{PixelStore, Pixels},
+    projector::Slide,
 };
 
 /// Stream of the sensor's own pattern; exposures count from 0 and do not reach it.
@@ -45,7 +47,7 @@ pub(crate) fn full_scale_dn(bits: u8) -> u16 {
     u16::MAX >> (16 - bits)
 }
 
-/// Light and identity of one exposure.
+/// Light and identity of one exposure: all that its frame depends on besides the response.
 #[derive(Debug, Clone)]
 pub(crate) struct Exposure {
     /// Number since the rig was made: what its noise depends on.
@@ -56,6 +58,23 @@ pub(crate) struct Exposure {
     pub(crate) ambient_e: f64,
     /// Whether something has been bumped before it.
     pub(crate) bumped: bool,
+}
+
+impl Exposure {
+    /// Whether the frames of both are the same, but for light that no slide is rendered for anyway.
+    pub(crate) fn is_same_as(&self, other: &Self) -> bool {
+        let total: f64 = self.light.iter().map(|(_, weight)| weight).sum();
+        let weight_in = |light: &Mixture, slide: &Arc<Slide>| -> f64 {
+            let of = |(its, _): &&(Arc<Slide>, f64)| Arc::ptr_eq(its, slide) || its == slide;
+            light.iter().filter(of).map(|(_, weight)| weight).sum()
+        };
+        let same_light = |(slide, _): &(Arc<Slide>, f64)| {
+            let difference = weight_in(&self.light, slide) - weight_in(&other.light, slide);
+            difference.abs() <= NEGLIGIBLE_SHARE * total
+        };
+        (self.number, self.ambient_e, self.bumped) == (other.number, other.ambient_e, other.bumped)
+            && self.light.iter().chain(&other.light).all(same_light)
+    }
 }
 
 /// Renders exposures of one world.

@@ -9,9 +9,9 @@ use thiserror::Error;
 
 use super::{
     camera::SimCameras, description::RigDescription, panel::Panel, projector::SimProjectors,
-    render::Renderer, scene::Scene, script::Script, timeline::Timeline, world::World,
+    rehearsal::Rehearsal, render::Renderer, scene::Scene, script::Script, timeline::Timeline, world::World,
 };
-use crate::{camera::Region, clock::Clock, error::DeviceError};
+use crate::{camera::Region, clock::Clock, error::DeviceError, projector::Slide};
 
 /// Why a rig cannot be built.
 #[derive(Debug, Clone, PartialEq, Error)]
@@ -87,6 +87,10 @@ pub(crate) struct Shared {
     /// Factor that automatic exposure, where there is one, puts on the exposure time.
     automatic: Mutex<f64>,
     timeline: Mutex<Timeline>,
+    /// Slides of the projector.
+    loaded: Mutex<Vec<Arc<Slide>>>,
+    /// Frames that were rendered before they were exposed.
+    rehearsed: Mutex<Option<Rehearsal>>,
     /// Exposures since the rig was made.
     exposures: AtomicU64,
     /// Region of the latest applied settings.
@@ -124,6 +128,24 @@ impl Shared {
         let mut factor = self.automatic.lock().unwrap_or_else(PoisonError::into_inner);
         let error = (automatic.target / mean_share.max(1e-3)).clamp(0.1, 10.0);
         *factor = (*factor * error.powf(automatic.speed)).clamp(SHORTEST_AUTOMATIC, LONGEST_AUTOMATIC);
+    }
+
+    pub(crate) fn set_loaded(&self, slides: Vec<Arc<Slide>>) {
+        *self.loaded.lock().unwrap_or_else(PoisonError::into_inner) = slides;
+    }
+
+    pub(crate) fn loaded(&self) -> Vec<Arc<Slide>> {
+        self.loaded.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    /// Frames that were rendered in advance.
+    pub(crate) fn rehearsed(&self) -> MutexGuard<'_, Option<Rehearsal>> {
+        self.rehearsed.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Number that the next exposure will have.
+    pub(crate) fn coming_exposure(&self) -> u64 {
+        self.exposures.load(Ordering::Relaxed)
     }
 
     /// Number of a new exposure.
@@ -208,6 +230,8 @@ impl Rig {
             script,
             automatic: Mutex::new(1.0),
             timeline: Mutex::new(Timeline::new(description)),
+            loaded: Mutex::default(),
+            rehearsed: Mutex::default(),
             exposures: AtomicU64::new(0),
             region: Mutex::default(),
             camera_open: AtomicBool::new(false),

@@ -13,7 +13,7 @@ use super::{
 use crate::{clock::Timestamp, projector::Slide};
 
 /// Slides with less than this share of an exposure are left out, so that a settled picture is exact.
-const NEGLIGIBLE_SHARE: f64 = 1e-9;
+pub(crate) const NEGLIGIBLE_SHARE: f64 = 1e-9;
 
 /// One change of the picture.
 #[derive(Debug, Clone)]
@@ -24,7 +24,7 @@ struct Change {
 }
 
 /// The pictures of a projector over time.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub(crate) struct Timeline {
     /// Time between refreshes: whole nanoseconds, so that a timeline can be shifted by refreshes without any change.
     period_ns: u64,

@@ -66,6 +66,7 @@ pub fn open(
         sensor_width,
         sensor_height,
         triggered: false,
+        overlap: None,
     };
     Ok(Box::new(V4l2Camera { work: Some(sender), thread: Some(thread), info, arrivals: None, gone }))
 }

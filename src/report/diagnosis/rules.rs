@@ -519,9 +519,14 @@ pub fn notes(input: &ReportInput, pixels: Option<&PixelCounts>) -> Vec<String> {
     if let Some(capture) = input.capture {
         if !capture.timing_measured {
             notes.push(
-                "the projector's timing was assumed, with a margin; `polscan calibrate sync` measures it and may make \
-                 scans faster"
-                    .to_owned(),
+                format!(
+                    "the projector's timing was assumed, with a margin{}; `polscan calibrate sync` measures it and may \
+                     make scans faster",
+                    capture.synchrony.as_ref().map_or(String::new(), |assumed| format!(
+                        ": light {:.1} ms after a flip, settled {:.1} ms later",
+                        assumed.projector_latency_ms, assumed.projector_settling_ms
+                    ))
+                ),
             );
         }
         if !capture.retaken.is_empty() {

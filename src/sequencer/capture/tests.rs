@@ -4,7 +4,7 @@
 use std::sync::Mutex;
 
 use polscan_drivers::{
-    camera::{AppliedSettings, CameraInfo, CameraSettings, PixelFormat, TriggerSource},
+    camera::{AppliedSettings, CameraInfo, CameraSettings, Overlap, PixelFormat, TriggerSource},
     clock::{MonotonicClock, VirtualClock},
     frame::{FrameStamp, PixelStore, Pixels},
     projector::{ProjectorInfo, ProjectorTiming, ReceiptMethod},
@@ -13,7 +13,7 @@ use polscan_patterns::{Axis, Mode, Polarization, ProjectorSize, Sequence};
 use proptest::prelude::*;
 
 use super::*;
-use crate::sequencer::plan::PlanOptions;
+use crate::sequencer::plan::{Order, PlanOptions};
 
 const REFRESH_NS: u64 = 16_666_667;
 const LATENCY: Duration = Duration::from_micros(33_334);
@@ -225,7 +225,7 @@ impl Eye {
     fn frame(&self, frame_id: u64, trigger: u64, start: Timestamp, received: Timestamp) -> Frame {
         let stamp = FrameStamp { frame_id, trigger, exposure_start: start, received, device_time_ns: None };
         let width = if self.world.has(Fault::Shrink(frame_id)) { 1 } else { 2 };
-        let store: Arc<dyn PixelStore> = Arc::new(vec![self.world.seen(start); width]);
+        let store: Arc<dyn PixelStore> = Arc::new(vec![NO_SLIDE; width]);
         Frame { width: width as u32, height: 1, bit_depth: 12, stamp, store }
     }
 
@@ -304,7 +304,9 @@ impl Camera for Eye {
                     return Err(DeviceError::BadData { device: "eye".into(), detail: "half a frame".into() });
                 }
                 self.delivered += 1;
-                Ok(frame)
+                // Looked up only now: what was flipped after the trigger counts too.
+                let seen = vec![self.world.seen(frame.stamp.exposure_start); frame.width as usize];
+                Ok(Frame { store: Arc::new(seen), ..frame })
             }
             None => {
                 self.world.clock.sleep_until(until);
@@ -473,6 +475,7 @@ fn rig_on(clock: Arc<dyn Clock>, faults: &[Fault]) -> (Arc<World>, Panel, Eye) {
             sensor_width: 2,
             sensor_height: 1,
             triggered: true,
+            overlap: Some(OVERLAP),
         },
         armed: false,
         disarmed: 0,
@@ -485,10 +488,20 @@ fn rig_on(clock: Arc<dyn Clock>, faults: &[Fault]) -> (Arc<World>, Panel, Eye) {
     (world, panel, eye)
 }
 
-fn run_judged(faults: &[Fault], mut judge: Script) -> Run {
+/// What a camera promises that takes triggers while it reads out.
+const OVERLAP: Overlap = Overlap { latency: Duration::ZERO, stamped: true };
+
+fn run_judged(faults: &[Fault], judge: Script) -> Run {
+    run_with(Some(OVERLAP), faults, judge)
+}
+
+fn run_with(overlap: Option<Overlap>, faults: &[Fault], mut judge: Script) -> Run {
     let (world, mut panel, mut eye) = rig(faults);
+    eye.info.overlap = overlap;
     let polarization = Polarization::green_horizontal();
-    let plan = Plan::new(sequence(), polarization, &panel.info, applied(), &PlanOptions::default()).unwrap();
+    let plan =
+        Plan::new(sequence(), polarization, &panel.info, &eye.info, applied(), &PlanOptions::default())
+            .unwrap();
     world.clock.sleep_until(Timestamp(5_000_000_000));
     let began = world.clock.now();
     let mut progress = Vec::new();
@@ -515,13 +528,54 @@ fn run_judged(faults: &[Fault], mut judge: Script) -> Run {
     Run { result, world, judge, blacks: panel.blacks, disarmed: eye.disarmed, progress, began }
 }
 
+/// With the next flip over the readout; and, as an oracle, with each frame in hand before the next slide is asked for.
 fn run(faults: &[Fault]) -> Run {
-    let run = run_judged(faults, Script::default());
-    assert_eq!(run.disarmed, 1, "disarmed once");
-    if let Ok(record) = &run.result {
-        assert_proven(record);
+    let (run, plain) = in_both_orders(faults);
+    // A cancelled capture has what it had by then.
+    if !matches!(&run.result, Err(failure) if *failure.error == CaptureError::Cancelled) {
+        assert_eq!(account(&run), account(&plain), "{faults:?}");
     }
     run
+}
+
+fn in_both_orders(faults: &[Fault]) -> (Run, Run) {
+    let [run, plain] = [Some(OVERLAP), None].map(|overlap| {
+        let run = run_with(overlap, faults, Script::default());
+        assert_eq!(run.disarmed, 1, "disarmed once");
+        if let Ok(record) = &run.result {
+            assert_proven(record);
+            let order = if overlap.is_some() { Order::Overlapped } else { Order::OneByOne };
+            assert_eq!(record.synchrony.order, order);
+        }
+        run
+    });
+    (run, plain)
+}
+
+/// All of a run that does not depend on its order: pictures, slides, what was repeated and why, how it ended.
+#[derive(Debug, PartialEq)]
+struct Account<'a> {
+    frames: Vec<(Role, u16, Option<u32>)>,
+    retakes: Vec<(String, &'a str, u32)>,
+    references: usize,
+    findings: Vec<&'a str>,
+    discarded: Vec<&'a str>,
+    end: &'a str,
+}
+
+fn account(run: &Run) -> Account<'_> {
+    let (frames, notes, end) = match &run.result {
+        Ok(record) => (&record.frames, &record.notes, "complete"),
+        Err(failure) => (&failure.partial.frames, &failure.partial.notes, failure.error.reason()),
+    };
+    Account {
+        frames: frames.iter().map(|f| (f.role, value(&f.frame), f.receipt.slide)).collect(),
+        retakes: run.retakes(),
+        references: notes.references_retaken.len(),
+        findings: run.findings(),
+        discarded: notes.discarded.iter().map(|finding| finding.reason.as_str()).collect(),
+        end,
+    }
 }
 
 /// Each frame shows its own slide and nothing else, as the rig itself knows; but for references that are reported.
@@ -574,10 +628,38 @@ fn a_healthy_rig_is_captured_at_the_display_s_own_pace() {
 }
 
 #[test]
+fn both_orders_show_and_expose_at_the_same_times_where_nothing_goes_wrong() {
+    let (run, plain) = in_both_orders(&[]);
+    let times = |run: &Run| -> Vec<(PresentReceipt, Timestamp, FrameStamp)> {
+        run.record().frames.iter().map(|f| (f.receipt, f.triggered, f.frame.stamp)).collect()
+    };
+    assert_eq!(times(&run), times(&plain));
+    assert_eq!(run.record().seconds, plain.record().seconds);
+    let synchrony = &run.record().synchrony;
+    assert_eq!(synchrony.idle_refreshes, Some(0));
+    // The trigger delay is written in ms, to the nearest double.
+    assert!(synchrony.phase_error_us.is_some_and(|error| error.worst < 1e-6), "{synchrony:?}");
+    // Without a millisecond that nobody needs: 13 holds, and the last frame's own way.
+    let expected = Duration::from_nanos(REFRESH_NS) * 13 * 4 + Duration::from_micros(53_234 + 2_000 + 6_100);
+    assert!((run.record().seconds - expected.as_secs_f64()).abs() < 1e-9, "{}", run.record().seconds);
+}
+
+#[test]
+fn a_frame_that_is_late_within_the_hold_costs_nothing_where_the_flip_does_not_wait_for_it() {
+    // 20 ms later than computed: the next flip is long done, the next trigger still far.
+    let late = [3, 6, 9].map(|frame| Fault::Delay(frame, Duration::from_millis(20)));
+    let (run, plain) = in_both_orders(&late);
+    let idle = |run: &Run| run.record().synchrony.idle_refreshes;
+    assert_eq!((idle(&run), idle(&plain)), (Some(0), Some(3)));
+}
+
+#[test]
 fn a_capture_in_real_time_is_proven_like_one_in_virtual_time() {
     let (world, mut panel, mut eye) = rig_on(Arc::new(MonotonicClock::start()), &[Fault::Drop(4)]);
     let polarization = Polarization::green_horizontal();
-    let plan = Plan::new(sequence(), polarization, &panel.info, applied(), &PlanOptions::default()).unwrap();
+    let plan =
+        Plan::new(sequence(), polarization, &panel.info, &eye.info, applied(), &PlanOptions::default())
+            .unwrap();
     let mut judge = Script::default();
     let record =
         capture(&mut panel, &mut eye, &*world.clock, &plan, &mut judge, &mut |_| {}, &world.cancel).unwrap();
@@ -787,7 +869,9 @@ fn cancelled_before_it_begins_it_shows_nothing() {
     let (world, mut panel, mut eye) = rig(&[]);
     world.cancel.cancel();
     let polarization = Polarization::green_horizontal();
-    let plan = Plan::new(sequence(), polarization, &panel.info, applied(), &PlanOptions::default()).unwrap();
+    let plan =
+        Plan::new(sequence(), polarization, &panel.info, &eye.info, applied(), &PlanOptions::default())
+            .unwrap();
     let mut judge = Script::default();
     let result = capture(&mut panel, &mut eye, &*world.clock, &plan, &mut judge, &mut |_| {}, &world.cancel);
     assert_eq!(result.unwrap_err().error.reason(), "cancelled");
@@ -833,7 +917,9 @@ fn references_that_drifted_are_reported() {
 fn a_judge_that_panics_leaves_the_projector_black_and_the_camera_idle() {
     let (world, mut panel, mut eye) = rig(&[]);
     let polarization = Polarization::green_horizontal();
-    let plan = Plan::new(sequence(), polarization, &panel.info, applied(), &PlanOptions::default()).unwrap();
+    let plan =
+        Plan::new(sequence(), polarization, &panel.info, &eye.info, applied(), &PlanOptions::default())
+            .unwrap();
     let mut judge = Script { panics: true, ..Script::default() };
     let result = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| {
         capture(&mut panel, &mut eye, &*world.clock, &plan, &mut judge, &mut |_| {}, &world.cancel)
@@ -875,11 +961,37 @@ fn any_fault() -> impl Strategy<Value = Fault> {
     ]
 }
 
+/// What a camera can do wrong, and no clock decides what comes of it.
+fn camera_fault() -> impl Strategy<Value = Fault> {
+    let ms = |range: std::ops::Range<u64>| range.prop_map(Duration::from_millis);
+    prop_oneof![
+        (0u64..20).prop_map(Fault::Drop),
+        (0u64..20).prop_map(Fault::Deaf),
+        (0u64..20, ms(0..200)).prop_map(|(n, delay)| Fault::Delay(n, delay)),
+        (0u64..20).prop_map(Fault::Duplicate),
+        (0u64..20).prop_map(Fault::Damage),
+        (0u64..20).prop_map(Fault::Shrink),
+        (0u64..20, ms(0..60)).prop_map(|(n, early)| Fault::Early(n, early)),
+        (0u64..60).prop_map(Fault::CameraGone),
+        (0u64..60).prop_map(Fault::Silent),
+    ]
+}
+
 proptest! {
+    /// The order decides when things are done, never what comes of them.
+    #[test]
+    fn both_orders_come_to_the_same_frames_and_the_same_end(
+        faults in prop::collection::vec(camera_fault(), 0..5),
+    ) {
+        let (run, plain) = in_both_orders(&faults);
+        prop_assert_eq!(account(&run), account(&plain));
+    }
+
     /// Whatever goes wrong: a record is right in each frame, or the failure has a name; and the rig is left safe.
     #[test]
     fn no_fault_makes_a_wrong_record(faults in prop::collection::vec(any_fault(), 0..6)) {
-        let run = run(&faults);
+        let (run, plain) = in_both_orders(&faults);
+        for run in [&run, &plain] {
         match &run.result {
             Ok(record) => prop_assert!(record.retaken.len() + record.notes.references_retaken.len() <= 6),
             Err(failure) => {
@@ -893,5 +1005,6 @@ proptest! {
         prop_assert!(run.ends_black() || run.findings().contains(&"projector-not-black"));
         // Bounded: 20 takes of a fifth of a second and 6 waits for lost frames, at the most.
         prop_assert!(run.world.clock.now().since(run.began) < Duration::from_secs(20));
+        }
     }
 }

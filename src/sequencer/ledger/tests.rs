@@ -1,6 +1,9 @@
 use std::time::Duration;
 
-use polscan_drivers::projector::ProjectorInfo;
+use polscan_drivers::{
+    camera::{CameraInfo, Overlap},
+    projector::ProjectorInfo,
+};
 
 use super::*;
 use crate::sequencer::plan::PlanOptions;
@@ -8,6 +11,10 @@ use crate::sequencer::plan::PlanOptions;
 const REFRESH: u64 = 10_000_000;
 
 fn timing() -> Timing {
+    timing_with(None)
+}
+
+fn timing_with(overlap: Option<Overlap>) -> Timing {
     let projector = ProjectorInfo {
         driver: "test".into(),
         model: "panel".into(),
@@ -18,7 +25,17 @@ fn timing() -> Timing {
         display: None,
         timing: None,
     };
-    Timing::new(&projector, 2000.0, 0.0, &PlanOptions::default()).unwrap()
+    let camera = CameraInfo {
+        driver: "test".into(),
+        model: "eye".into(),
+        serial: "1".into(),
+        sensor_width: 2,
+        sensor_height: 1,
+        triggered: true,
+        overlap,
+    };
+    let readout_us = if overlap.is_some() { 6000.0 } else { 0.0 };
+    Timing::new(&projector, &camera, 2000.0, readout_us, &PlanOptions::default()).unwrap()
 }
 
 fn receipt(slide: u32, refresh: u64) -> PresentReceipt {
@@ -107,7 +124,7 @@ impl Camera {
         let exposure_start = Timestamp(at.0.saturating_add_signed(offset_ms * 1_000_000));
         let received = exposure_start + Duration::from_millis(8);
         let stamp = FrameStamp { frame_id, trigger, exposure_start, received, device_time_ns: None };
-        let window = Window { at, started: at };
+        let window = Window { at, started: at, next_light: None };
         self.exposures.enter(&timing(), window, &stamp).err().map(|refusal| refusal.reason)
     }
 }
@@ -184,4 +201,24 @@ fn a_free_running_camera_counts_frames_that_nobody_asked_for() {
     assert_eq!(camera.trigger().frame(23, 0, 12), None);
     assert_eq!(camera.trigger().frame(24, 0, -30), Some("stale-frame"));
     assert_eq!(camera.frame(24, 0, 0), Some("duplicate-frame"));
+}
+
+#[test]
+fn a_stamp_that_was_not_measured_needs_an_arrival_that_excludes_the_next_picture() {
+    let overlap = |stamped| Some(Overlap { latency: Duration::from_millis(1), stamped });
+    let (at, light) = (Timestamp(500_000_000), Timestamp(510_000_000));
+    let window = Window { at, started: at, next_light: Some(light) };
+    let arrive = |stamped, after_light_us: u64| {
+        let received = light + Duration::from_micros(after_light_us);
+        let stamp =
+            FrameStamp { frame_id: 0, trigger: 0, exposure_start: at, received, device_time_ns: None };
+        let mut exposures = Exposures::new(true);
+        exposures.trigger();
+        exposures.enter(&timing_with(overlap(stamped)), window, &stamp).err()
+    };
+    // With a readout of 6 ms an arrival 6 ms after the next light is of an exposure that ended before that.
+    assert_eq!(arrive(false, 6000), None);
+    let refusal = arrive(false, 6001).unwrap();
+    assert_eq!((refusal.reason, refusal.may_come), ("late-frame", false));
+    assert_eq!(arrive(true, 60_000), None, "its stamp says when it was exposed");
 }

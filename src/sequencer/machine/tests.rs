@@ -1,17 +1,27 @@
 use std::time::Duration;
 
 use polscan_drivers::{
-    camera::{AppliedSettings, CameraSettings, PixelFormat, TriggerSource},
+    camera::{AppliedSettings, CameraInfo, CameraSettings, Overlap, PixelFormat, TriggerSource},
+    frame::FrameStamp,
     projector::{ProjectorInfo, ProjectorTiming},
 };
 use polscan_patterns::{Mode, Polarization, ProjectorSize, Sequence};
 use proptest::prelude::*;
 
 use super::*;
-use crate::sequencer::plan::PlanOptions;
+use crate::sequencer::{
+    judge::{PairVerdict, Suspicion},
+    plan::PlanOptions,
+};
+
+mod pace;
 
 fn plan(mode: Mode) -> Plan {
-    let projector = ProjectorInfo {
+    plan_for(mode, None)
+}
+
+fn projector() -> ProjectorInfo {
+    ProjectorInfo {
         driver: "test".into(),
         model: "panel".into(),
         serial: "1".into(),
@@ -23,7 +33,22 @@ fn plan(mode: Mode) -> Plan {
             latency: Duration::from_millis(20),
             settling: Duration::from_millis(10),
         }),
-    };
+    }
+}
+
+fn camera(overlap: Option<Overlap>) -> CameraInfo {
+    CameraInfo {
+        driver: "test".into(),
+        model: "eye".into(),
+        serial: "1".into(),
+        sensor_width: 2,
+        sensor_height: 1,
+        triggered: true,
+        overlap,
+    }
+}
+
+fn plan_for(mode: Mode, overlap: Option<Overlap>) -> Plan {
     let settings = CameraSettings {
         exposure_us: 2000.0,
         gain_db: 0.0,
@@ -42,8 +67,9 @@ fn plan(mode: Mode) -> Plan {
         noise: None,
     };
     let sequence = Sequence::new(mode, ProjectorSize { width: 4, height: 2 }).unwrap();
-    Plan::new(sequence, Polarization::green_horizontal(), &projector, applied, &PlanOptions::default())
-        .unwrap()
+    let (projector, camera) = (projector(), camera(overlap));
+    let polarization = Polarization::green_horizontal();
+    Plan::new(sequence, polarization, &projector, &camera, applied, &PlanOptions::default()).unwrap()
 }
 
 fn after(ms: u64) -> Duration {
@@ -62,7 +88,16 @@ struct Story {
 
 impl Story {
     fn begin(mode: Mode) -> Self {
-        let machine = Machine::new(&plan(mode), true);
+        Self::of(&plan(mode))
+    }
+
+    /// With a camera that takes triggers while it reads out.
+    fn overlapped(mode: Mode) -> Self {
+        Self::of(&plan_for(mode, Some(Overlap { latency: Duration::ZERO, stamped: true })))
+    }
+
+    fn of(plan: &Plan) -> Self {
+        let machine = Machine::new(plan, true);
         let mut story = Self {
             machine,
             now: Timestamp(1_000_000_000),
@@ -98,7 +133,7 @@ impl Story {
                 Some(Event::Triggered(self.now))
             }
             Action::AwaitFrame { .. } => {
-                self.now = self.triggered + after(7);
+                self.now = self.now.max(self.triggered + after(7));
                 let stamp = self.stamp(self.frames, self.triggered);
                 self.frames += 1;
                 Some(Event::FrameArrived(stamp))
@@ -544,6 +579,62 @@ fn cancel_ends_in_every_state() {
 }
 
 #[test]
+fn the_next_slide_is_asked_for_when_the_exposure_is_over_and_exposed_when_the_frame_is_in_hand() {
+    let mut story = Story::overlapped(Mode::Pse);
+    let Action::Trigger { at } = story.until(|action| matches!(action, Action::Trigger { .. })) else {
+        unreachable!("stopped at another action")
+    };
+    let flip = story.now;
+    story.now = at;
+    story.tell(Event::Triggered(at));
+    // Delay 31 ms, exposure 2, guard 2; a quarter into the refresh before the next flip is earlier.
+    assert_eq!(story.actions, [Action::Show { step: 1, not_before: flip + after(35) }]);
+    story.actions.clear();
+    story.now = flip + after(40);
+    story.tell(Event::Presented(story.receipt(1)));
+    let deadline = at + after(2 + 5 + 250);
+    assert_eq!(story.actions, [Action::AwaitFrame { deadline }]);
+    story.actions.clear();
+    story.tell(Event::FrameArrived(story.stamp(0, at)));
+    assert_eq!(
+        story.actions,
+        [
+            Action::Keep { step: 0 },
+            Action::Accept { group: 0 },
+            Action::Trigger { at: flip + after(40 + 31) }
+        ]
+    );
+}
+
+#[test]
+fn a_frame_lost_behind_the_next_slide_is_taken_again_before_that() {
+    let mut story = Story::overlapped(Mode::Pse);
+    // The frame of step 3, the last of its pair, is awaited when slide 4 of the next pair is on the glass.
+    story.until_shown(4);
+    story.now = Timestamp((story.now.0 / 10_000_000 + 2) * 10_000_000);
+    story.tell(Event::Presented(story.receipt(4)));
+    assert!(matches!(story.actions.pop_front(), Some(Action::AwaitFrame { .. })));
+    story.frames += 1;
+    story.tell(Event::TimedOut);
+    assert_eq!(story.outcome(), Outcome::Complete);
+    assert_eq!(story.shown(), [0, 1, 2, 3, 4, 2, 3, 4, 5, 6, 7, 8, 9]);
+    assert_eq!(story.retakes(), [(2, "lost-frame", 1)]);
+}
+
+#[test]
+fn a_slide_that_fails_over_a_frame_costs_its_own_group_only() {
+    let timeout = DeviceError::Timeout { device: "d".into(), awaited: "flip", timeout_ms: 5 };
+    let mut story = Story::overlapped(Mode::Pse);
+    story.until_shown(4);
+    story.tell(Event::DeviceFailed(Device::Projector, timeout));
+    assert!(matches!(story.actions.front(), Some(Action::AwaitFrame { .. })));
+    assert_eq!(story.outcome(), Outcome::Complete);
+    assert_eq!(story.shown(), [0, 1, 2, 3, 4, 4, 5, 6, 7, 8, 9]);
+    assert_eq!(story.retakes(), [(3, "missed-flip", 1)]);
+    assert!(story.trace.contains(&Action::Judge(Subject::Pair { group: 2 })));
+}
+
+#[test]
 fn an_impossible_event_ends_the_scan_as_a_defect() {
     let mut story = Story::begin(Mode::Pse);
     story.tell(Event::Triggered(story.now));
@@ -627,7 +718,7 @@ fn twisted(story: &mut Story, action: &Action, whim: &Whim, anything: bool) -> O
 }
 
 /// Holds for every trace of actions and events, however mad the events.
-fn assert_sane(story: &Story, log: &[Result<Action, Event>]) {
+fn assert_sane(story: &Story, overlapped: bool, log: &[Result<Action, Event>]) {
     let finishes = story.trace.iter().filter(|action| matches!(action, Action::Finish(_))).count();
     let blacks = story.trace.iter().filter(|action| **action == Action::Black).count();
     assert_eq!((finishes, blacks), (1, 1));
@@ -635,25 +726,29 @@ fn assert_sane(story: &Story, log: &[Result<Action, Event>]) {
     assert!(matches!(story.trace.last(), Some(Action::Finish(_))));
     assert!(story.machine.retaken().len() <= 6);
     // Groups and repeats, of two steps with show, trigger, awaits and keep, with notice, judgement and acceptance.
-    assert!(story.trace.len() <= (7 + 6) * (2 * (3 + MAX_DISCARDED as usize + 1) + 3) + 2);
+    // Each repeat may have cost a slide that was on the glass too early.
+    assert!(story.trace.len() <= (7 + 6) * (2 * (3 + MAX_DISCARDED as usize + 1) + 3) + 2 + 6 * 2);
 
-    // One slide at a time: shown, then exposed to its end, or refused.
-    let (mut presenting, mut exposing, mut fresh) = (false, false, false);
+    // One slide at a time: shown, then exposed to its end, or refused; and one frame at a time.
+    let (mut presenting, mut triggering, mut exposing, mut fresh) = (false, false, false, false);
     for entry in log {
         match entry {
             Ok(Action::Show { .. }) => {
-                assert!(!presenting && !exposing, "a second slide in flight");
+                assert!(!presenting && !triggering, "a second slide in flight");
+                assert!(overlapped || !exposing, "a slide over a frame that is awaited");
                 presenting = true;
             }
             Ok(Action::Trigger { .. }) => {
-                assert!(!presenting && !exposing, "an exposure without its slide");
-                exposing = true;
+                assert!(!presenting && !triggering, "an exposure without its slide");
+                assert!(!exposing, "a second frame in flight");
+                triggering = true;
             }
             Ok(Action::Keep { .. }) => {
                 assert!(std::mem::take(&mut fresh), "a frame kept that did not arrive")
             }
             Err(Event::Presented(_)) => presenting = false,
-            Err(Event::DeviceFailed(..)) => (presenting, exposing) = (false, false),
+            Err(Event::Triggered(_)) => (triggering, exposing) = (false, true),
+            Err(Event::DeviceFailed(..)) => (presenting, triggering, exposing) = (false, false, false),
             Err(Event::FrameArrived(_)) => (exposing, fresh) = (false, true),
             Err(Event::TimedOut) => exposing = false,
             Ok(Action::AwaitFrame { .. }) => exposing = true,
@@ -662,8 +757,8 @@ fn assert_sane(story: &Story, log: &[Result<Action, Event>]) {
     }
 }
 
-fn run_with(whims: &[Whim], anything: bool) -> Story {
-    let mut story = Story::begin(Mode::Pse);
+fn run_with(whims: &[Whim], overlapped: bool, anything: bool) -> Story {
+    let mut story = if overlapped { Story::overlapped(Mode::Pse) } else { Story::begin(Mode::Pse) };
     let mut log: Vec<Result<Action, Event>> = Vec::new();
     let mut whims = whims.iter();
     let mut bound = 2000;
@@ -678,14 +773,17 @@ fn run_with(whims: &[Whim], anything: bool) -> Story {
         }
     }
     assert!(story.machine.ended(), "stuck: {:?}", story.trace);
-    assert_sane(&story, &log);
+    assert_sane(&story, overlapped, &log);
     story
 }
 
 proptest! {
     #[test]
-    fn whatever_devices_and_judge_do_the_scan_ends_once_and_black(whims in prop::collection::vec(whim(), 0..120)) {
-        let story = run_with(&whims, false);
+    fn whatever_devices_and_judge_do_the_scan_ends_once_and_black(
+        whims in prop::collection::vec(whim(), 0..120),
+        overlapped in any::<bool>(),
+    ) {
+        let story = run_with(&whims, overlapped, false);
         let defect = story.trace.iter().any(|action| {
             matches!(action, Action::Finish(Outcome::Failed(diagnosis)) if diagnosis.reason == "out-of-order")
         });
@@ -695,7 +793,8 @@ proptest! {
     #[test]
     fn whatever_events_come_in_whatever_order_the_scan_ends_once_and_black(
         whims in prop::collection::vec(whim(), 0..120),
+        overlapped in any::<bool>(),
     ) {
-        run_with(&whims, true);
+        run_with(&whims, overlapped, true);
     }
 }

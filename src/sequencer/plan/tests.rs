@@ -1,6 +1,7 @@
 use super::*;
 use polscan_drivers::{
-    camera::{CameraSettings, PixelFormat, TriggerSource},
+    camera::{CameraSettings, Overlap, PixelFormat, TriggerSource},
+    clock::Timestamp,
     projector::ProjectorTiming,
 };
 use polscan_patterns::{ChannelSet, Mode};
@@ -27,6 +28,23 @@ fn hz60(timing: Option<(f64, f64)>) -> ProjectorInfo {
     projector(Duration::from_nanos(16_666_667), timing.map(|(latency, settling)| (ms(latency), ms(settling))))
 }
 
+fn camera(overlap: Option<Overlap>) -> CameraInfo {
+    CameraInfo {
+        driver: "test".into(),
+        model: "eye".into(),
+        serial: "1".into(),
+        sensor_width: 2,
+        sensor_height: 1,
+        triggered: true,
+        overlap,
+    }
+}
+
+/// A camera that waits for nobody.
+fn overlapping() -> CameraInfo {
+    camera(Some(Overlap { latency: Duration::ZERO, stamped: true }))
+}
+
 fn applied(exposure_us: f64, readout_us: f64) -> AppliedSettings {
     AppliedSettings {
         settings: CameraSettings {
@@ -51,7 +69,8 @@ fn sequence(mode: Mode) -> Sequence {
 }
 
 fn plan(mode: Mode, projector: &ProjectorInfo, options: &PlanOptions) -> Result<Plan, PlanError> {
-    Plan::new(sequence(mode), Polarization::green_horizontal(), projector, applied(2000.0, 6100.0), options)
+    let polarization = Polarization::green_horizontal();
+    Plan::new(sequence(mode), polarization, projector, &overlapping(), applied(2000.0, 6100.0), options)
 }
 
 #[test]
@@ -75,7 +94,7 @@ fn an_unmeasured_projector_gets_conservative_times() {
     assert!((timing.settling.as_secs_f64() - 0.036_667).abs() < 1e-6);
     assert_eq!(timing.hold_refreshes, 6);
     // Its latency protects nothing.
-    assert_eq!(timing.next_light(Timestamp(0)), Timestamp(0) + timing.hold());
+    assert_eq!(timing.light_after(Timestamp(7)), Timestamp(7));
 }
 
 #[test]
@@ -100,9 +119,16 @@ fn impossible_plans_are_refused_by_name() {
     let options = PlanOptions::default();
     let new = |projector: &ProjectorInfo, exposure, readout, options: &PlanOptions| {
         let polarization = Polarization::green_horizontal();
-        Plan::new(sequence(Mode::Pse), polarization, projector, applied(exposure, readout), options)
-            .unwrap_err()
-            .to_string()
+        Plan::new(
+            sequence(Mode::Pse),
+            polarization,
+            projector,
+            &camera(None),
+            applied(exposure, readout),
+            options,
+        )
+        .unwrap_err()
+        .to_string()
     };
     let rig = hz60(None);
     assert!(new(&rig, 0.0, 0.0, &options).starts_with("an exposure of 0 us"));
@@ -120,7 +146,7 @@ fn impossible_plans_are_refused_by_name() {
     assert!(new(&small, 2e3, 0.0, &options).contains("1024x768 px but panel has 800x600"));
     let none = ChannelSet { red: false, green: false, blue: false };
     let dark = Polarization { vertical: none, ..Polarization::green_horizontal() };
-    let refused = |mode| Plan::new(sequence(mode), dark, &rig, applied(2e3, 0.0), &options);
+    let refused = |mode| Plan::new(sequence(mode), dark, &rig, &camera(None), applied(2e3, 0.0), &options);
     assert!(matches!(refused(Mode::Pse), Err(PlanError::Polarization(_))));
     assert!(refused(Mode::Gray).is_ok());
 }
@@ -141,6 +167,33 @@ fn steps_are_grouped_with_references_first() {
     }
 }
 
+#[test]
+fn the_order_and_why_are_told() {
+    let timing = |camera: &CameraInfo, readout_us: f64| {
+        Timing::new(&hz60(Some((33.3, 18.9))), camera, 2000.0, readout_us, &PlanOptions::default()).unwrap()
+    };
+    let told = |timing: &Timing| (timing.order, timing.hold_refreshes);
+    // A readout of 20 ms costs a refresh where it is waited for, and nothing where it is not.
+    let quick = timing(&overlapping(), 20_000.0);
+    assert_eq!(told(&quick), (Order::Overlapped, 4));
+    assert!(quick.order_reason.contains("fit into the hold"));
+    let plain = timing(&camera(None), 20_000.0);
+    assert_eq!(told(&plain), (Order::OneByOne, 5));
+    assert!(plain.order_reason.contains("does not promise"));
+    // 150 ms do not fit into four refreshes.
+    assert_eq!(told(&timing(&overlapping(), 150_000.0)), (Order::Overlapped, 10));
+    assert_eq!(told(&timing(&camera(None), 150_000.0)), (Order::OneByOne, 13));
+    // The slower its answer to a trigger, the longer the guard, until there is nothing to be gained.
+    let slow = |ms| camera(Some(Overlap { latency: Duration::from_millis(ms), stamped: false }));
+    assert_eq!(told(&timing(&slow(9), 20_000.0)), (Order::Overlapped, 5));
+    let slower = timing(&slow(40), 20_000.0);
+    assert_eq!((told(&slower), slower.guard), ((Order::OneByOne, 5), Duration::ZERO));
+    assert!(slower.order_reason.contains("costs no more"));
+    let free = timing(&CameraInfo { triggered: false, ..overlapping() }, 20_000.0);
+    assert_eq!(told(&free), (Order::OneByOne, 5));
+    assert!(free.order_reason.contains("when it likes"));
+}
+
 prop_compose! {
     fn any_rig()(
         period_us in 2_000u64..100_000,
@@ -152,7 +205,8 @@ prop_compose! {
         margin_us in 0u64..5_000,
         tolerance_us in 0u64..5_000,
         lead_us in 0u64..5_000,
-    ) -> (ProjectorInfo, f64, f64, PlanOptions) {
+        overlap in prop::option::of((0u64..10_000, any::<bool>())),
+    ) -> (ProjectorInfo, CameraInfo, f64, f64, PlanOptions) {
         let us = Duration::from_micros;
         let projector = projector(us(period_us), measured.then(|| (us(latency_us), us(settling_us))));
         let options = PlanOptions {
@@ -161,25 +215,35 @@ prop_compose! {
             submit_lead: us(lead_us),
             ..PlanOptions::default()
         };
-        (projector, exposure_us, readout_us, options)
+        let camera = camera(overlap.map(|(latency, stamped)| Overlap { latency: us(latency), stamped }));
+        (projector, camera, exposure_us, readout_us, options)
     }
 }
 
 proptest! {
     #[test]
     fn the_exposure_lies_wholly_in_the_stable_window(
-        (projector, exposure_us, readout_us, options) in any_rig(),
+        (projector, camera, exposure_us, readout_us, options) in any_rig(),
         flip in 0u64..1_000_000_000_000,
         late_us in 0u64..1_000_000,
         spare in 0u32..5,
     ) {
-        let least = Timing::new(&projector, exposure_us, readout_us, &options).unwrap();
+        let least = Timing::new(&projector, &camera, exposure_us, readout_us, &options).unwrap();
         let hold = Some(least.hold_refreshes + spare);
-        let timing = Timing::new(&projector, exposure_us, readout_us, &PlanOptions { hold_refreshes: hold, ..options }).unwrap();
+        let timing = Timing::new(&projector, &camera, exposure_us, readout_us, &PlanOptions { hold_refreshes: hold, ..options }).unwrap();
         let flip = Timestamp(flip);
         let at = timing.trigger_at(flip, flip);
         prop_assert!(at >= flip + timing.latency + timing.settling + options.stamp_tolerance);
-        prop_assert!(at + timing.exposure + timing.readout + options.submit_lead <= timing.next_light(flip));
+        // The next slide can be asked for in time when the exposure is over for certain, or its frame in hand.
+        let next = flip + timing.hold();
+        let over = match timing.order {
+            Order::Overlapped => timing.exposed(at),
+            Order::OneByOne => at + timing.exposure + timing.readout,
+        };
+        prop_assert!(over + options.submit_lead <= next);
+        prop_assert!(timing.light_after(next) >= next);
+        // And the frame is in hand before the next exposure.
+        prop_assert!(at + timing.exposure + timing.readout <= timing.trigger_at(next, next));
 
         // A late trigger comes a whole number of refreshes later, and no more than it must.
         let now = flip + Duration::from_micros(late_us);
@@ -196,17 +260,29 @@ proptest! {
     }
 
     #[test]
-    fn the_hold_is_the_smallest_that_is_safe((projector, exposure_us, readout_us, options) in any_rig()) {
-        let timing = Timing::new(&projector, exposure_us, readout_us, &options).unwrap();
-        let busy = timing.trigger_delay + timing.exposure + timing.readout + options.submit_lead;
-        let mut slow = 1;
-        while timing.refresh_period * slow < busy {
-            slow += 1;
-        }
+    fn the_hold_is_the_smallest_that_is_safe(
+        (projector, camera, exposure_us, readout_us, options) in any_rig(),
+    ) {
+        let timing = Timing::new(&projector, &camera, exposure_us, readout_us, &options).unwrap();
+        let delay = timing.trigger_delay + timing.exposure;
+        let least = |fits: &dyn Fn(Duration) -> bool| {
+            (1..).find(|&hold| fits(timing.refresh_period * hold)).unwrap_or(u32::MAX)
+        };
+        let one_by_one = least(&|hold| delay + timing.readout + options.submit_lead <= hold);
+        let overlapped = camera.overlap.map(|overlap| {
+            let guard = overlap.latency + options.stamp_tolerance * 2;
+            let margin = options.margin.max(options.stamp_tolerance);
+            least(&|hold| {
+                delay + guard + options.submit_lead <= hold
+                    && timing.exposure + guard + timing.readout + margin <= hold
+            })
+        });
+        let slow = overlapped.map_or(one_by_one, |overlapped| overlapped.min(one_by_one));
         prop_assert_eq!(timing.hold_refreshes, slow);
+        prop_assert_eq!(timing.order == Order::Overlapped, overlapped.is_some_and(|hold| hold <= one_by_one));
         if slow > 1 {
             let shorter = PlanOptions { hold_refreshes: Some(slow - 1), ..options };
-            let refused = Timing::new(&projector, exposure_us, readout_us, &shorter);
+            let refused = Timing::new(&projector, &camera, exposure_us, readout_us, &shorter);
             prop_assert_eq!(refused, Err(PlanError::ShortHold { hold: slow - 1, needed: slow }));
         }
     }

@@ -20,7 +20,7 @@ use crate::{
     cloud::DEFAULT_ROW_GATE_PX,
     decode::{DecodeSettings, Thresholds},
     report::{NamedRegion, Reason},
-    sequencer::{CaptureNotes, CaptureRecord, Retake},
+    sequencer::{CaptureNotes, CaptureRecord, Retake, Synchrony},
     truth::TruthObject,
 };
 
@@ -247,6 +247,9 @@ pub struct Capture {
     pub hold_refreshes: u32,
     /// Whether latency and settling were measured.
     pub timing_measured: bool,
+    /// How flips and exposures kept step.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub synchrony: Option<Synchrony>,
     /// Counters of the camera's stream.
     pub statistics: StreamStatistics,
     /// Evidence of each frame, in the order of the sequence.
@@ -269,6 +272,10 @@ pub struct FrameEvidence {
     /// When its exposure was asked for, on the rig's clock.
     #[serde(rename = "triggered_ns")]
     pub triggered: Timestamp,
+    /// How far the exposure is off the phase to the flip that all should have, in us; early is negative, whole refreshes do
+    /// not count.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub phase_error_us: Option<f64>,
     /// Identity of the exposure.
     pub stamp: FrameStamp,
 }
@@ -370,6 +377,7 @@ impl Manifest {
             latency_ms: record.latency_ms,
             hold_refreshes: record.hold_refreshes,
             timing_measured: record.timing_measured,
+            synchrony: Some(record.synchrony.clone()),
             statistics: record.statistics.clone(),
             frames: record
                 .frames
@@ -377,6 +385,9 @@ impl Manifest {
                 .map(|frame| FrameEvidence {
                     receipt: frame.receipt,
                     triggered: frame.triggered,
+                    phase_error_us: record
+                        .synchrony
+                        .phase_error_us_of(&frame.receipt, frame.frame.stamp.exposure_start),
                     stamp: frame.frame.stamp,
                 })
                 .collect(),

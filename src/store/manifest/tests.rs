@@ -310,6 +310,7 @@ fn a_full_manifest_of_our_own_survives() {
             method: ReceiptMethod::Simulated,
         },
         triggered: Timestamp(index * 16_666_667 + 1),
+        phase_error_us: Some(-0.5),
         stamp: FrameStamp {
             frame_id: index,
             trigger: index,
@@ -324,6 +325,7 @@ fn a_full_manifest_of_our_own_survives() {
         latency_ms: 33.3,
         hold_refreshes: 1,
         timing_measured: true,
+        synchrony: Some(crate::sequencer::Synchrony::default()),
         statistics: StreamStatistics::default(),
         frames: (0..sequence.roles.len() as u64).map(evidence).collect(),
         retaken: vec![Retake {
