@@ -1,8 +1,9 @@
 //! E57 (ASTM E2807): one scan, organised, in metres, with normals.
 //!
 //! Points are in the camera frame and the pose of the scan is where the camera stands in the world, which is how the standard
-//! means it: programs that apply the pose show the world frame. There is no sigma: an attribute of our own makes some readers
-//! refuse the whole scan.
+//! means it: programs that apply the pose show the world frame. There is no sigma: the standard and its extensions have no
+//! attribute for it, and one of our own no program would show. Points are in the order of the cloud, so that the sigmas of
+//! the other formats fit.
 
 use std::io::{self, Cursor, Write};
 
