@@ -12,7 +12,7 @@ use crate::{
 
 #[test]
 fn exports_are_those_of_the_command_line() {
-    let daemon = Daemon::fast().started();
+    let daemon = Daemon::fast();
     let scan = daemon.finished_scan();
     let id = scan["id"].as_str().expect("an identity");
     let folder = tempfile::tempdir().expect("a folder");
@@ -54,7 +54,7 @@ fn exports_are_those_of_the_command_line() {
 
 #[test]
 fn what_is_not_there_yet_is_409_and_what_never_will_be_404() {
-    let daemon = Daemon::real_time().started();
+    let daemon = Daemon::real_time();
     let id = daemon.scan(&json!({}));
     assert_eq!(daemon.get(&format!("/v1/scans/{id}/export/cloud.e57")).expect(409).slug(), "not-finished");
     assert_eq!(daemon.get(&format!("/v1/scans/{id}/export/cloud.las")).expect(404).slug(), "no-artifact");
