@@ -1,5 +1,5 @@
 # Two commands are all that is needed: `make run` and `make test`. Both install what is missing first.
-.PHONY: run serve test captures foreign-plane python page page-test closed-loop faults soak kills service-figures fuzz accuracy bench api-fuzz systemd v4l2 book documents deb setup install ci
+.PHONY: run serve test captures foreign-plane exports python page page-test closed-loop faults soak kills service-figures fuzz accuracy bench api-fuzz systemd v4l2 book documents deb setup install ci
 
 run: ## build, serve the simulated rig, scan it over REST, say where the results are
 	@scripts/install build
@@ -44,6 +44,10 @@ service-figures: ## what the service costs: time to the first pattern, overhead,
 foreign-plane: ## check the decoder from outside, with an independent numpy model
 	@scripts/install test
 	@scripts/foreign-plane
+
+exports: ## open the exported formats with readers of others and compare every value
+	@scripts/install test
+	@scripts/exports
 
 python: ## check the Python package, its cookbook and its notebook against the service on the simulated rig
 	@scripts/install test

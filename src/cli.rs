@@ -34,6 +34,8 @@ enum Command {
     Scan(Scan),
     /// Decode recorded frames, our own or foreign ones.
     Decode(Decode),
+    /// Write a scan in the formats of other programs: E57, PCD, XYZ, OBJ; maps as TIFF and PNG.
+    Export(commands::ExportArgs),
     /// Compare the paper's method, ordinary Gray code and pse on one scene, as one page and one file of figures.
     Compare(Compare),
     /// Measure what the rig is like, for scans to use.
@@ -297,6 +299,7 @@ fn dispatch(cli: &Cli) -> Result<u8, Failure> {
             };
             commands::decode(&request, &args.out, cli.json)
         }
+        Command::Export(args) => commands::export(args, cli.json),
         Command::Compare(args) => {
             let bundles = args.bundles();
             let what = match bundles.is_empty() {

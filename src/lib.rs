@@ -11,6 +11,7 @@ pub mod config;
 pub mod doctor;
 pub mod engine;
 mod evidence;
+pub mod export;
 pub mod measure;
 pub mod pipeline;
 pub mod report;

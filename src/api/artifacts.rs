@@ -37,7 +37,7 @@ use crate::{
 };
 
 /// Bytes that are read at once.
-const CHUNK: usize = 256 << 10;
+pub(super) const CHUNK: usize = 256 << 10;
 
 /// Chunks of an archive that may wait for a slow client.
 const CHUNKS: usize = 8;
@@ -75,7 +75,7 @@ struct Found {
 }
 
 /// Reads the manifest of a bundle; the hash of the file itself comes with it.
-fn manifest(folder: &Path) -> Option<(Manifest, FileEntry)> {
+pub(super) fn manifest(folder: &Path) -> Option<(Manifest, FileEntry)> {
     let bytes = std::fs::read(folder.join(FILE_NAME)).ok()?;
     let manifest = Manifest::parse(&bytes).ok()?.manifest;
     Some((manifest, FileEntry { bytes: bytes.len() as u64, sha256: hex(&Sha256::digest(&bytes)) }))
@@ -99,11 +99,11 @@ pub async fn artifacts(app: &App, record: &Record) -> Result<Vec<Artifact>, Prob
     app.blocking(list).await
 }
 
-fn no_artifact(name: &str) -> Problem {
+pub(super) fn no_artifact(name: &str) -> Problem {
     Kind::NoArtifact.with(format!("there is no {name:?}; the scan's `artifacts` lists its files"))
 }
 
-fn not_finished(record: &Record) -> Problem {
+pub(super) fn not_finished(record: &Record) -> Problem {
     let state = record.state.name();
     Kind::NotFinished
         .with(format!("the scan is {state}; ask again when it is done, or wait with ?wait=done"))
@@ -178,12 +178,12 @@ fn span(range: Option<&str>, bytes: u64) -> Span {
     }
 }
 
-fn header_text(headers: &HeaderMap, name: header::HeaderName) -> Option<&str> {
+pub(super) fn header_text(headers: &HeaderMap, name: header::HeaderName) -> Option<&str> {
     headers.get(name).and_then(|value| value.to_str().ok())
 }
 
 /// Whether one of the tags of a header is this one.
-fn has_tag(header: Option<&str>, tag: &str) -> bool {
+pub(super) fn has_tag(header: Option<&str>, tag: &str) -> bool {
     header.is_some_and(|list| {
         list.split(',')
             .map(|item| item.trim().trim_start_matches("W/"))
@@ -191,12 +191,12 @@ fn has_tag(header: Option<&str>, tag: &str) -> bool {
     })
 }
 
-fn value(text: &str) -> HeaderValue {
+pub(super) fn value(text: &str) -> HeaderValue {
     HeaderValue::from_str(text).unwrap_or(HeaderValue::from_static(""))
 }
 
 /// The tag of a file with this hash, and the headers that say what it is.
-fn described(name: &str, sha256: &str) -> (String, HeaderMap) {
+pub(super) fn described(name: &str, sha256: &str) -> (String, HeaderMap) {
     let tag = format!("\"{sha256}\"");
     let mut headers = HeaderMap::new();
     headers.insert(header::ETAG, value(&tag));

@@ -5,6 +5,7 @@ mod artifacts;
 mod auth;
 mod calibrations;
 mod document;
+mod exports;
 mod extract;
 mod live;
 mod pages;
@@ -62,6 +63,8 @@ pub struct App {
     index: Arc<Mutex<Option<Index>>>,
     requests: Arc<Semaphore>,
     streams: Arc<Semaphore>,
+    /// Exports are made one at a time, so that a decode keeps its processors.
+    exports: Arc<Semaphore>,
     wait_limit: Duration,
     stopping: watch::Receiver<bool>,
     started: Instant,
@@ -84,6 +87,7 @@ impl App {
             index: Arc::default(),
             requests: Arc::new(Semaphore::new(api.concurrency)),
             streams: Arc::new(Semaphore::new(api.streams)),
+            exports: Arc::new(Semaphore::new(1)),
             wait_limit: scans::wait_limit(api.wait_limit_s),
             stopping,
             started: Instant::now(),
@@ -143,6 +147,7 @@ fn router() -> OpenApiRouter<App> {
         .routes(routes!(artifacts::get_summary))
         .routes(routes!(artifacts::get_artifact))
         .routes(routes!(artifacts::get_map))
+        .routes(routes!(exports::get_export))
         .routes(routes!(scans::resume_queue))
         .routes(routes!(scans::pause_queue))
         .routes(routes!(live::get_events))

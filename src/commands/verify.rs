@@ -7,23 +7,17 @@ use std::{
     time::SystemTime,
 };
 
-use nalgebra::{Matrix3, Vector3};
 use polscan_calibration::artefact::{Accepted, Artefact, Check, Kind, PixelPoint, Point, judge};
 use serde::{Deserialize, Serialize};
 use serde_json::json;
 
 use super::{failure::FAILED, say, scan::take};
 use crate::{
-    cloud::{flag, read_ply},
+    cloud::{PlyPoint, flag},
     config::{ConfigError, Settings},
     engine::Failure,
-    geometry::{Pose, ReadHints},
-    store::{
-        Policy, StorageError,
-        maps::{self, Maps},
-        source::{read_bounded, read_calibration},
-        time::rfc3339_utc,
-    },
+    export::Scan,
+    store::{Policy, StorageError, measured::CLOUD_FILE_NAME, source::read_bounded, time::rfc3339_utc},
 };
 
 /// Name of the history in the store.
@@ -116,45 +110,21 @@ fn read_artefact(path: &Path) -> Result<Artefact, Failure> {
     Ok(artefact)
 }
 
-/// The points of a scan with their camera pixels: a cloud has a point for each measured pixel, row by row.
+/// The points of a scan with their camera pixels, in the camera's frame, in which each point is uncertain along its ray.
 fn read_cloud(bundle: &Path) -> Result<Vec<PixelPoint>, Failure> {
-    let bad =
-        |name: &str, detail: String| Failure::data(format!("read {}", bundle.join(name).display()), detail);
-    let ply = std::fs::read(bundle.join("cloud.ply"))
-        .map_err(|error| bad("cloud.ply", format!("{error}; a scan without a calibration has no cloud")))?;
-    let points = read_ply(&ply).map_err(|error| bad("cloud.ply", error.to_string()))?;
-    let file =
-        File::open(bundle.join(maps::FILE_NAME)).map_err(|error| bad(maps::FILE_NAME, error.to_string()))?;
-    let maps = Maps::read(BufReader::new(file)).map_err(|detail| bad(maps::FILE_NAME, detail))?;
-    let width = maps.mask.width();
-    let measured: Vec<usize> =
-        maps.mask.data().iter().enumerate().filter(|(_, set)| **set).map(|(index, _)| index).collect();
-    if measured.len() != points.len() {
-        let detail = format!("has {} points, the maps beside it {}", points.len(), measured.len());
-        return Err(bad("cloud.ply", detail));
-    }
-    let camera_from_cloud = camera_from_cloud(bundle)?;
-    let at = |(index, point): (usize, crate::cloud::PlyPoint)| PixelPoint {
-        x: (index % width) as u32,
-        y: (index / width) as u32,
-        point: Point {
-            mm: camera_from_cloud.transform(&Vector3::from(point.point_mm.map(f64::from))).into(),
-            sigma_z_mm: f64::from(point.sigma_z_mm),
-        },
+    let scan = Scan::read(bundle)?;
+    let Some(cloud) = scan.cloud else {
+        let operation = format!("read {}", bundle.join(CLOUD_FILE_NAME).display());
+        return Err(Failure::data(operation, "there is none; a scan without a calibration has no cloud"));
+    };
+    let at = |((pixel, point), (mm, _)): ((&usize, &PlyPoint), ([f64; 3], _))| PixelPoint {
+        x: (pixel % cloud.width) as u32,
+        y: (pixel / cloud.width) as u32,
+        point: Point { mm, sigma_z_mm: f64::from(point.sigma_z_mm) },
     };
     // At a silhouette a pixel sees two surfaces, and its depth is that of neither.
-    let one_surface = |(_, point): &(usize, crate::cloud::PlyPoint)| point.flags & flag::SILHOUETTE == 0;
-    Ok(measured.into_iter().zip(points).filter(one_surface).map(at).collect())
-}
-
-/// What brings the cloud of a scan back into the camera's frame, in which each point is uncertain along its ray: clouds are in
-/// the world frame of their calibration where that has one.
-fn camera_from_cloud(bundle: &Path) -> Result<Pose, Failure> {
-    let path = bundle.join("calibration.toml");
-    let calibration = read_calibration(&path, &ReadHints::default())
-        .map_err(|error| Failure::data(format!("read {}", path.display()), error))?;
-    let camera = Pose { rotation: Matrix3::identity(), translation_mm: Vector3::zeros() };
-    Ok(calibration.world_from_camera.map_or(camera, |pose| pose.inverse()))
+    let one_surface = |one: &((_, &PlyPoint), _)| one.0.1.flags & flag::SILHOUETTE == 0;
+    Ok(cloud.pixels.iter().zip(&cloud.points).zip(cloud.in_camera()).filter(one_surface).map(at).collect())
 }
 
 fn read_history(path: &Path) -> Result<Vec<Entry>, Failure> {

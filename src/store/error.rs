@@ -115,6 +115,12 @@ pub enum StorageError {
         /// What is there.
         found: String,
     },
+    /// A single file is there already, which is never overwritten.
+    #[error("cannot write the result to {}: it exists already; name a file that does not", path.display())]
+    Exists {
+        /// The file.
+        path: PathBuf,
+    },
     /// The target is the input itself or lies in it.
     #[error("cannot write the result to {}: it would change the bundle {}; name a folder outside it",
         path.display(), bundle.display())]

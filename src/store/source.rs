@@ -24,7 +24,7 @@ use crate::{
 };
 
 /// Longest manifest that is read, in bytes.
-const MAX_MANIFEST_BYTES: u64 = 32 << 20;
+pub(crate) const MAX_MANIFEST_BYTES: u64 = 32 << 20;
 
 /// What the array `object` of the truth holds where there is none.
 const NO_OBJECT: u8 = 255;

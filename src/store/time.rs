@@ -18,6 +18,27 @@ pub fn rfc3339_utc(time: SystemTime) -> String {
     )
 }
 
+/// Time since 1970 of a text such as [`rfc3339_utc`] writes, with or without a fraction of a second. `None` for anything else.
+pub fn parse_rfc3339_utc(text: &str) -> Option<Duration> {
+    let (date, clock) = text.strip_suffix('Z')?.split_once('T')?;
+    let (clock, fraction) = clock.split_once('.').unwrap_or((clock, "0"));
+    let numbers = |text: &str, mark: char| -> Option<[u64; 3]> {
+        let parts: Vec<u64> = text.split(mark).map(|part| part.parse().ok()).collect::<Option<_>>()?;
+        parts.try_into().ok()
+    };
+    let ([year, month, day], [hour, minute, second]) = (numbers(date, '-')?, numbers(clock, ':')?);
+    let digits = !fraction.is_empty() && fraction.bytes().all(|digit| digit.is_ascii_digit());
+    if !digits || !(1970..=9999).contains(&year) || hour > 23 || minute > 59 || second > 60 {
+        return None;
+    }
+    // Whoever knows how days become dates need not know the reverse: a date lies within its year.
+    let first = (year - 1970) * 365 + (year - 1969) / 4 - (year - 1901) / 100 + (year - 1601) / 400;
+    let days = (first..first + 366).find(|days| civil_from_days(*days) == (year, month, day))?;
+    let seconds = days * SECONDS_PER_DAY + hour * 3600 + minute * 60 + second;
+    let fraction: f64 = format!("0.{fraction}").parse().ok()?;
+    Some(Duration::from_secs(seconds) + Duration::from_secs_f64(fraction))
+}
+
 /// Date of the Gregorian calendar, `days` after 1970-01-01.
 fn civil_from_days(days: u64) -> (u64, u64, u64) {
     // Counting from a 1 March puts the leap day last in the year, and 400 years are a whole number of days.
@@ -57,6 +78,30 @@ mod tests {
     fn dates_agree_with_a_calendar_walked_day_by_day() {
         for days in (0..80_000).step_by(97).chain(18_321..18_330).chain(47_482..47_490) {
             assert_eq!(civil_from_days(days), oracle(days), "day {days}");
+        }
+    }
+
+    #[test]
+    fn written_times_are_read_back() {
+        for millis in (0..8_000_000_000_000).step_by(86_399_871 * 11) {
+            let since = Duration::from_millis(millis);
+            let text = rfc3339_utc(UNIX_EPOCH + since);
+            let read = parse_rfc3339_utc(&text).expect(&text);
+            assert!(read.abs_diff(since) < Duration::from_micros(1), "{text}: {read:?}, {since:?}");
+        }
+        assert_eq!(parse_rfc3339_utc("2024-02-29T12:34:56Z"), Some(Duration::from_secs(1_709_210_096)));
+        for wrong in [
+            "",
+            "Z",
+            "2024-02-30T00:00:00Z",
+            "2024-02-29 12:34:56Z",
+            "2024-02-29T12:34:56",
+            "2024-02-29T12:34:56.Z",
+            "2024-02-29T24:00:00Z",
+            "1969-12-31T23:59:59Z",
+            "99999999999999999999-01-01T00:00:00Z",
+        ] {
+            assert_eq!(parse_rfc3339_utc(wrong), None, "{wrong}");
         }
     }
 

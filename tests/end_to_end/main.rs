@@ -9,6 +9,7 @@ mod captures_of_the_twin;
 mod cases;
 mod compare;
 mod devices;
+mod export;
 mod faults;
 mod patterns;
 mod projection;

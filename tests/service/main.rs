@@ -3,6 +3,7 @@
 mod calibrations;
 mod client;
 mod daemon;
+mod exports;
 mod kills;
 mod lifecycle;
 #[allow(dead_code, reason = "the long runs print what is measured here")]
