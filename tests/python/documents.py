@@ -31,6 +31,7 @@ TYPES = {
     "src/report/accuracy.rs": ["Accuracy"],
     "src/report/diagnosis/mod.rs": ["Reason"],
     "src/sequencer/record.rs": ["Retake", "ReferenceRetake", "Finding"],
+    "src/sequencer/synchrony.rs": ["Synchrony", "PhaseError"],
     "reconstruction/src/decode/types.rs": ["NoiseModel"],
 }
 
