@@ -402,11 +402,14 @@ impl Open {
         let camera = self.rig.camera.info().serial.clone();
         let period = self.rig.projector.info().refresh_period.as_secs_f64();
         let clock = self.rig.clock.clone();
-        let mut first_flip = None;
+        let (mut first_flip, mut rehearsed_ms) = (None, 0.0);
         let mut progress = |progress: Progress<'_>| {
             shared.heartbeat.beat();
             match progress {
-                Progress::Started { frames, .. } => shared.tell(News::Started { id: id.clone(), frames }),
+                Progress::Started { frames, rehearsed, .. } => {
+                    rehearsed_ms = 1e3 * rehearsed.as_secs_f64();
+                    shared.tell(News::Started { id: id.clone(), frames });
+                }
                 Progress::Captured { done, frame, .. } => {
                     spool(disk::Task::Frame { id: id.clone(), frame: Box::new(frame.clone()) });
                     shared.preview.offer(&frame.frame, &self.prepared.applied);
@@ -416,7 +419,7 @@ impl Open {
                         let ago = clock.now().since(frame.receipt.flipped);
                         let waited = job.accepted.map(|accepted| accepted.elapsed().saturating_sub(ago));
                         let after_accepted_ms = waited.map(|waited| 1e3 * waited.as_secs_f64());
-                        tracing::info!(after_accepted_ms, "first pattern shown");
+                        tracing::info!(after_accepted_ms, rehearsed_ms, "first pattern shown");
                         frame.receipt.flipped
                     });
                     let refreshes = frame.receipt.flipped.since(first).as_secs_f64() / period;

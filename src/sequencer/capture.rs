@@ -72,6 +72,8 @@ pub enum Progress<'a> {
         frames: usize,
         /// Time that it will take where nothing is repeated.
         expected: Duration,
+        /// Time that the camera took to get ready for the timetable: what a simulated one renders in advance.
+        rehearsed: Duration,
     },
     /// A frame has arrived and its identity holds. It may still be taken again.
     Captured {
@@ -119,7 +121,7 @@ pub fn capture(
     let roles = &plan.sequence.roles;
     let mut machine = Machine::new(plan, camera.info().triggered);
     let mut rig = Rig { projector, camera, dark: None, armed: true };
-    let prepared = rig.prepare(plan, cancel);
+    let prepared = rig.prepare(plan, clock, cancel);
     let mut shell = Shell {
         rig,
         clock,
@@ -136,11 +138,12 @@ pub fn capture(
         last_frame: None,
         outcome: None,
     };
-    if prepared.is_ok() {
-        (shell.progress)(Progress::Started { frames: roles.len(), expected: plan.expected() });
+    if let Ok(rehearsed) = prepared {
+        let (frames, expected) = (roles.len(), plan.expected());
+        (shell.progress)(Progress::Started { frames, expected, rehearsed });
         shell.run(&mut machine);
     }
-    shell.conclude(&machine, prepared)
+    shell.conclude(&machine, prepared.map(drop))
 }
 
 /// The devices, left black and disarmed when dropped, also by a panic of the judge.
@@ -152,7 +155,13 @@ struct Rig<'a> {
 }
 
 impl Rig<'_> {
-    fn prepare(&mut self, plan: &Plan, cancel: &CancelFlag) -> Result<(), Box<CaptureError>> {
+    /// Loads the slides, lets the camera get ready for them, and arms it. Returns what getting ready took.
+    fn prepare(
+        &mut self,
+        plan: &Plan,
+        clock: &dyn Clock,
+        cancel: &CancelFlag,
+    ) -> Result<Duration, Box<CaptureError>> {
         let slides: Vec<Slide> = plan
             .sequence
             .roles
@@ -163,13 +172,16 @@ impl Rig<'_> {
         self.projector.load(&slides).map_err(load)?;
         let arm = |source| Box::new(CaptureError::Arm { frames: slides.len(), source });
         let schedule = plan.schedule();
+        let begun = clock.now();
         // One call a frame at the most; more would be a device that never gets ready.
         for _ in 0..slides.len() {
             if cancel.is_cancelled() || self.camera.rehearse(&schedule).map_err(arm)? == 0 {
                 break;
             }
         }
-        self.camera.arm(slides.len()).map_err(arm)
+        let rehearsed = clock.now().since(begun);
+        self.camera.arm(slides.len()).map_err(arm)?;
+        Ok(rehearsed)
     }
 
     fn black(&mut self) -> Result<PresentReceipt, DeviceError> {

@@ -63,16 +63,18 @@ fn figures_of_the_first_pattern() {
     }
     let log = daemon.log();
     let shown = log.lines().filter_map(|line| {
-        let entry: Value = serde_json::from_str(line).ok()?;
-        (entry["fields"]["message"] == "first pattern shown")
-            .then(|| entry["fields"]["after_accepted_ms"].as_f64())?
+        let fields = &serde_json::from_str::<Value>(line).ok()?["fields"];
+        (fields["message"] == "first pattern shown")
+            .then(|| Some((fields["after_accepted_ms"].as_f64()?, fields["rehearsed_ms"].as_f64()?)))?
     });
-    let shown: Vec<f64> = shown.skip(1).collect();
+    let shown: Vec<(f64, f64)> = shown.skip(1).collect();
     assert_eq!(shown.len(), SCANS);
-    let sum = asked.iter().zip(&shown).map(|(asked, shown)| ms(*asked) + shown).collect();
+    let all = asked.iter().zip(&shown).map(|(asked, (shown, _))| ms(*asked) + shown).collect();
+    let own = asked.iter().zip(&shown).map(|(asked, (shown, rehearsed))| ms(*asked) + shown - rehearsed);
     say("request until its answer", asked.iter().map(|asked| ms(*asked)).collect());
-    say("accepted until the first pattern is shown", shown);
-    say("request until the first pattern is shown, at most", sum);
+    say("rendering of the simulated rig in advance", shown.iter().map(|(_, rehearsed)| *rehearsed).collect());
+    say("request until the first pattern is shown, at most", all);
+    say("the same without what the simulated rig renders in advance", own.collect());
     describe("after");
 }
 
