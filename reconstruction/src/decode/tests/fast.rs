@@ -21,7 +21,8 @@ use crate::decode::{
 fn frames_of(mode: Mode, [width, height]: [usize; 2], seed: u64) -> (Vec<(Role, Vec<u16>)>, Rig) {
     let rig = Rig { width, height, ..Rig::default() };
     let jump = uniform(random(seed)) * width as f64;
-    let slope = 0.3 + uniform(random(seed ^ 1));
+    // All of it within the projector.
+    let slope = (0.3 + uniform(random(seed ^ 1))).min(700.0 / width as f64);
     let scene = |x: f64, y: f64| {
         let behind = x > jump;
         Spot {
