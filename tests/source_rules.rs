@@ -46,7 +46,7 @@ const UNSAFE: [&str; 6] = [
     "drivers/src/aravis/fake.rs",    // paints frames for the library's camera in software
     "drivers/src/aravis/library.rs", // finds cameras
     "drivers/src/v4l2/kernel.rs",    // asks the kernel and maps its buffers
-    "reconstruction/src/decode/simd.rs", // calls code compiled for registers that the processor was asked for
+    "reconstruction/src/simd.rs",    // calls code compiled for registers that the processor was asked for
     "src/store/frames.rs",           // maps a file of frames into memory
 ];
 

@@ -6,3 +6,4 @@ pub mod cloud;
 pub mod decode;
 pub mod geometry;
 pub mod grid;
+mod simd;

@@ -1,5 +1,6 @@
 //! From projector coordinates to points.
 
+mod normals;
 mod plane;
 mod ply;
 mod reconstruct;

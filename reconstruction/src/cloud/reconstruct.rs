@@ -4,13 +4,14 @@ use rayon::prelude::*;
 use thiserror::Error;
 
 use super::{
-    Cloud, Reconstruction, RowCheck, flag,
+    Cloud, Reconstruction, RowCheck, flag, normals,
     surface::{self, Surface},
 };
 use crate::{
     decode::{AxisMap, Class, Decoded},
     geometry::{Calibration, Measurement, Solution, TriangulateError, Triangulator},
     grid::Grid,
+    simd::InstructionSet,
 };
 
 /// Row gate in projector px unless the configuration says otherwise.
@@ -130,8 +131,9 @@ pub fn reconstruct_with(
     let row_check =
         coded.then(|| check_rows(&row, &class, settings.row_gate_px, triangulator.rows_per_column()));
     let surface = Surface::new(&point_mm, &sigma_z_mm, triangulator.rays());
-    let normal = surface::normals(&surface);
-    let flags = flags(decoded, &class, &surface::silhouettes(&surface));
+    let set = InstructionSet::widest();
+    let normal = normals::normals(set, &surface);
+    let flags = flags(decoded, &class, &surface::silhouettes(set, &surface));
     Ok(Reconstruction {
         cloud: Cloud { point_mm, normal, sigma_z_mm, flags },
         class,

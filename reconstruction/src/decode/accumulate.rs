@@ -8,12 +8,11 @@ use super::{
     noise, pair_sum,
     plan::{Frames, plan},
     sample::Sample,
-    simd::InstructionSet,
     subpixel,
     types::{Class, DecodeError, DecodeSettings, Decoded, Plane, SharedPlane},
     words::{PixelMaps, decode_pixels},
 };
-use crate::grid::Grid;
+use crate::{grid::Grid, simd::InstructionSet};
 
 /// Collects the frames of one scan and decodes them. Holds handles, so frames lie in memory once.
 #[derive(Clone)]

@@ -26,10 +26,10 @@ use rayon::prelude::*;
 use self::steps::{Crossings, RowSteps, StepCounts};
 use super::{
     plan::Frames,
-    simd::{InstructionSet, Work},
     types::{Class, Thresholds},
     words::{BLOCK, PixelMaps, WEAK_SCALE, WEAK_UNKNOWN},
 };
+use crate::simd::{InstructionSet, Work};
 
 /// Dissenting neighbours that outvote a single supporter: more than the four that the end of a line one pixel wide has
 /// where it meets the rim of the image.

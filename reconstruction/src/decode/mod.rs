@@ -14,7 +14,6 @@ mod oracle;
 mod pair_sum;
 mod plan;
 mod sample;
-mod simd;
 #[cfg(feature = "synthetic")]
 mod stages;
 mod subpixel;

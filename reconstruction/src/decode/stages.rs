@@ -11,11 +11,11 @@ use super::{
     noise, pair_sum,
     plan::plan,
     sample::Sample,
-    simd::InstructionSet,
     subpixel,
     types::{DecodeError, DecodeSettings, Plane, SharedPlane},
     words::{PixelMaps, decode_pixels},
 };
+use crate::simd::InstructionSet;
 
 /// Calls `visit` with the name of each stage and with what does the stage's work once each time that it is called.
 ///

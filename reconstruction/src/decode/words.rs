@@ -30,9 +30,9 @@ use super::{
     limits::Gates,
     plan::{AxisFrames, BitFrames, Frames, PrefixCode},
     sample::Sample,
-    simd::{InstructionSet, Work},
     types::Class,
 };
+use crate::simd::{InstructionSet, Work};
 
 /// Bits whose boundaries lie at least this far apart (in values) are coarse: the pattern is flat between them.
 const COARSE_SPACING: u32 = 16;

@@ -2,7 +2,10 @@
 //! counted in vector registers; what is rare is looked at one by one.
 
 use super::{AxisShape, gray};
-use crate::decode::{simd::Work, types::Class, words::BLOCK};
+use crate::{
+    decode::{types::Class, words::BLOCK},
+    simd::Work,
+};
 
 /// Steps from here on are counted together.
 const CAP: usize = 64;

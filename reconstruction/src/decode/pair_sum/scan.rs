@@ -5,14 +5,16 @@ use std::ops::Range;
 use rayon::prelude::*;
 
 use super::{DITHER_VARIANCE, NEAR_EDGE, OUTLIER_SIGMA, ROWS, Tally, dither, sampled_rows};
-use crate::decode::{
-    limits::Gates,
-    plan::{Frames, Levels, axis_position},
-    sample::Sample,
+use crate::{
+    decode::{
+        limits::Gates,
+        plan::{Frames, Levels, axis_position},
+        sample::Sample,
+        types::{Class, PairResidual},
+        whole::whole_part,
+        words::{BLOCK, PixelMaps, levels::means},
+    },
     simd::{InstructionSet, Work},
-    types::{Class, PairResidual},
-    whole::whole_part,
-    words::{BLOCK, PixelMaps, levels::means},
 };
 
 /// Residuals of all pairs of a scan, in order of axis and bit.

@@ -6,14 +6,16 @@ use polscan_patterns::{AxisCode, Mode, ProjectorSize, Role, Sequence};
 use proptest::prelude::*;
 
 use crate::decode::synth::{normal, random, uniform};
-use crate::decode::{
-    Accumulator, CameraResponse, Class, DecodeSettings, NoiseModel, SharedPlane, Thresholds,
-    limits::Gates,
-    oracle::decode_pixel,
-    plan::plan,
-    sample::Sample,
+use crate::{
+    decode::{
+        Accumulator, CameraResponse, Class, DecodeSettings, NoiseModel, SharedPlane, Thresholds,
+        limits::Gates,
+        oracle::decode_pixel,
+        plan::plan,
+        sample::Sample,
+        words::{PixelMaps, decode_pixels},
+    },
     simd::InstructionSet,
-    words::{PixelMaps, decode_pixels},
 };
 
 const WIDTH: usize = 16;

@@ -5,15 +5,17 @@ use std::sync::Arc;
 use polscan_patterns::{Axis, Mode, Role};
 use proptest::prelude::*;
 
-use crate::decode::{
-    CameraResponse, DecodeSettings, NoiseModel, PlaneSource, SharedPlane, gates,
-    limits::Gates,
-    pair_sum,
-    plan::{Frames, plan},
-    sample::Sample,
+use crate::{
+    decode::{
+        CameraResponse, DecodeSettings, NoiseModel, PlaneSource, SharedPlane, gates,
+        limits::Gates,
+        pair_sum,
+        plan::{Frames, plan},
+        sample::Sample,
+        synth::{Rig, Spot, random, sequence, uniform},
+        words::{self, PixelMaps, decode_pixels},
+    },
     simd::InstructionSet,
-    synth::{Rig, Spot, random, sequence, uniform},
-    words::{self, PixelMaps, decode_pixels},
 };
 
 /// Frames of two surfaces with a jump between them, and of what breaks scans: a saturated patch, a dark one, inverted
