@@ -8,10 +8,10 @@ use super::{
     surface::{self, Surface},
 };
 use crate::{
-    decode::{AxisMap, Class, Decoded},
-    geometry::{Calibration, Measurement, Solution, TriangulateError, Triangulator},
+    decode::{Class, Decoded},
+    geometry::{Calibration, LANES, Lane, Measurements, Solutions, TriangulateError, Triangulator},
     grid::Grid,
-    simd::InstructionSet,
+    simd::{InstructionSet, Work},
 };
 
 /// Row gate in projector px unless the configuration says otherwise.
@@ -105,6 +105,7 @@ pub fn reconstruct_with(
     // Error of the measured row where rows were coded, else the predicted row.
     let coded = decoded.row.is_some();
     let mut row = Grid::filled(width, height, f32::NAN);
+    let set = InstructionSet::widest();
     class
         .data_mut()
         .par_chunks_mut(width)
@@ -112,26 +113,12 @@ pub fn reconstruct_with(
         .zip(sigma_z_mm.data_mut().par_chunks_mut(width))
         .zip(row.data_mut().par_chunks_mut(width))
         .enumerate()
-        .for_each(|(y, (((class, point), sigma), row))| {
-            for x in (0..width).filter(|&x| decoded.class.at(x, y).is_valid()) {
-                let (verdict, solution) = judge(triangulator, decoded, settings, x, y);
-                if let Some(solution) = &solution {
-                    let value = if coded { solution.row_error_px } else { solution.projector_px[1] };
-                    row[x] = value as f32;
-                }
-                match (verdict, solution) {
-                    (None, Some(solution)) => {
-                        point[x] = solution.point_mm.map(|v| v as f32);
-                        sigma[x] = solution.sigma_z_mm as f32;
-                    }
-                    (verdict, _) => class[x] = verdict.unwrap_or(Class::OutOfVolume),
-                }
-            }
+        .for_each(|(y, (((class, point_mm), sigma_z_mm), row))| {
+            set.run(Points { triangulator, decoded, settings, y, class, point_mm, sigma_z_mm, row });
         });
     let row_check =
         coded.then(|| check_rows(&row, &class, settings.row_gate_px, triangulator.rows_per_column()));
     let surface = Surface::new(&point_mm, &sigma_z_mm, triangulator.rays());
-    let set = InstructionSet::widest();
     let normal = normals::normals(set, &surface);
     let flags = flags(decoded, &class, &surface::silhouettes(set, &surface));
     Ok(Reconstruction {
@@ -162,36 +149,81 @@ fn check(
     Ok(())
 }
 
-/// Measurement of one pixel; NaN for axes that were not coded.
-fn measurement(decoded: &Decoded, x: usize, y: usize) -> Measurement {
-    let read = |map: &AxisMap| (f64::from(map.coordinate.at(x, y)), f64::from(map.sigma.at(x, y)));
-    let (column, sigma_column) = read(&decoded.column);
-    let (row, sigma_row) = decoded.row.as_ref().map_or((f64::NAN, f64::NAN), read);
-    Measurement { column, sigma_column, row, sigma_row }
+/// Triangulates and judges the pixels of row `y`.
+struct Points<'a> {
+    triangulator: &'a Triangulator,
+    decoded: &'a Decoded,
+    settings: &'a ReconstructSettings,
+    y: usize,
+    class: &'a mut [Class],
+    point_mm: &'a mut [[f32; 3]],
+    sigma_z_mm: &'a mut [f32],
+    /// Error of the measured row where rows were coded, else the predicted row.
+    row: &'a mut [f32],
 }
 
-/// Solves one pixel. A class is why it is rejected; the solution is kept for the row statistics if it lies in the
-/// volume.
-fn judge(
-    triangulator: &Triangulator,
-    decoded: &Decoded,
-    settings: &ReconstructSettings,
-    x: usize,
-    y: usize,
-) -> (Option<Class>, Option<Solution>) {
-    let Some(solution) = triangulator.solve(x, y, &measurement(decoded, x, y)) else {
-        return (Some(Class::OutOfVolume), None);
-    };
-    let z = solution.point_mm[2];
-    // A ray nearly in the light plane meets it anywhere: such a depth says nothing of the volume.
-    let blind = solution.sigma_z_mm > 0.5 * (settings.far_mm - settings.near_mm);
-    if blind || !(settings.near_mm..=settings.far_mm).contains(&z) {
-        return (Some(Class::OutOfVolume), None);
+impl Work for Points<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run(mut self) {
+        for x in (0..self.class.len()).step_by(LANES) {
+            let lanes = LANES.min(self.class.len() - x);
+            let valid: [bool; LANES] = std::array::from_fn(|l| {
+                self.class[x..][..lanes].get(l).is_some_and(|class| class.is_valid())
+            });
+            if valid == [false; LANES] {
+                continue;
+            }
+            let solutions = self.triangulator.solve_lanes(x, self.y, &measurements(self.decoded, x, self.y));
+            for l in (0..lanes).filter(|&l| valid[l]) {
+                self.judge(x + l, l, &solutions);
+            }
+        }
     }
-    let gate = settings.row_gate_px.max(GATE_SIGMAS * solution.row_error_sigma_px);
-    // Not measured is NaN, which no comparison holds for: no row, no gate.
-    let rejected = solution.row_error_px.abs() > gate;
-    (rejected.then_some(Class::RowGate), Some(solution))
+}
+
+impl Points<'_> {
+    /// Keeps the point of one pixel or classes it by why it is rejected. What was measured of the row is kept for the
+    /// statistics if the point lies in the volume.
+    #[inline(always)]
+    fn judge(&mut self, x: usize, l: usize, solutions: &Solutions) {
+        let Self { settings, decoded, .. } = *self;
+        let (z, sigma_z_mm) = (solutions.point_mm[2][l], solutions.sigma_z_mm[l]);
+        // A ray nearly in the light plane meets it anywhere: such a depth says nothing of the volume.
+        let blind = sigma_z_mm > 0.5 * (settings.far_mm - settings.near_mm);
+        if !solutions.found[l] || blind || !(settings.near_mm..=settings.far_mm).contains(&z) {
+            self.class[x] = Class::OutOfVolume;
+            return;
+        }
+        let error_px = solutions.row_error_px[l];
+        self.row[x] = if decoded.row.is_some() { error_px } else { solutions.projector_px[1][l] } as f32;
+        let gate = settings.row_gate_px.max(GATE_SIGMAS * solutions.row_error_sigma_px[l]);
+        // Not measured is NaN, which no comparison holds for: no row, no gate.
+        if error_px.abs() > gate {
+            self.class[x] = Class::RowGate;
+            return;
+        }
+        self.point_mm[x] = [0, 1, 2].map(|axis| solutions.point_mm[axis][l] as f32);
+        self.sigma_z_mm[x] = sigma_z_mm as f32;
+    }
+}
+
+/// Measurements of the pixels from (x, y) on; NaN for axes that were not coded and beyond the row's end.
+#[inline(always)]
+fn measurements(decoded: &Decoded, x: usize, y: usize) -> Measurements {
+    let read = |map: Option<&Grid<f32>>| -> Lane {
+        let mut lane = [f64::NAN; LANES];
+        if let Some(map) = map {
+            lane.iter_mut().zip(&map.row(y)[x..]).for_each(|(lane, value)| *lane = f64::from(*value));
+        }
+        lane
+    };
+    let (column, row) = (&decoded.column, decoded.row.as_ref());
+    Measurements {
+        pixel: [read(Some(&column.coordinate)), read(row.map(|row| &row.coordinate))],
+        sigma: [read(Some(&column.sigma)), read(row.map(|row| &row.sigma))],
+    }
 }
 
 /// Median, spread and rejections over the pixels that were measured in both axes and lie in the volume.

@@ -77,7 +77,7 @@ impl Lens {
     }
 
     /// [`distort`](Self::distort) and its Jacobian as `(x', y', [dx'/dx, dx'/dy, dy'/dy])`; `dy'/dx = dx'/dy`.
-    #[inline]
+    #[inline(always)]
     pub(crate) fn distort_with_jacobian(&self, x: f64, y: f64) -> (f64, f64, [f64; 3]) {
         let [k1, k2, p1, p2, k3] = self.distortion;
         let r2 = x * x + y * y;

@@ -10,6 +10,7 @@ pub use calibration::{Calibration, Pose, Projector, Quality, SizeError};
 pub use file::{CalibrationError, MAX_BYTES, ReadHints};
 pub use lens::Lens;
 pub use rays::RayTable;
+pub(crate) use triangulate::{LANES, Lane, Measurements, Solutions};
 pub use triangulate::{Measurement, Solution, TriangulateError, Triangulator};
 
 #[cfg(test)]

@@ -5,8 +5,12 @@
 //! on `w`, with the lens distortion inside, reaches the last bit in two or three steps. Columns and rows are two
 //! measurements of the same `w`; they are weighed by their information where the rows carry any.
 
+mod lanes;
+
 use nalgebra::{Matrix3, Vector3};
 use thiserror::Error;
+
+pub(crate) use lanes::{LANES, Lane, Measurements, Solutions};
 
 use super::{Calibration, Lens, RayTable};
 
@@ -157,12 +161,13 @@ impl Triangulator {
         }
         let z = 1.0 / w;
         let [du, dv] = seen.slope;
-        let norm = du.hypot(dv);
+        let norm = (du * du + dv * dv).sqrt();
         let (mut row_error_px, mut row_error_sigma_px) = (f64::NAN, f64::NAN);
         if both {
             let missed = [pixel[0] - seen.pixel[0], pixel[1] - seen.pixel[1]];
+            let (along, across) = (du * sigmas[1], dv * sigmas[0]);
             row_error_px = du.signum() * (du * missed[1] - dv * missed[0]) / norm;
-            row_error_sigma_px = (du * sigmas[1]).hypot(dv * sigmas[0]) / norm;
+            row_error_sigma_px = (along * along + across * across).sqrt() / norm;
         }
         Some(Solution {
             point_mm: [dx * z, dy * z, z],
@@ -318,7 +323,7 @@ mod tests {
         }
     }
 
-    fn any_rig() -> impl Strategy<Value = Calibration> {
+    pub(super) fn any_rig() -> impl Strategy<Value = Calibration> {
         let baseline = (20.0..250.0f64, -3.1..3.1f64, -40.0..40.0f64);
         (baseline, -0.1..0.1f64, prop::array::uniform5(-1.0..1.0f64), 300.0..760.0f64).prop_map(
             |((length, angle, forward), roll, d, cy)| {

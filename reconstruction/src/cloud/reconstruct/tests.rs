@@ -7,7 +7,7 @@ use nalgebra::{Matrix3, Vector3};
 use super::*;
 use crate::{
     cloud::{CloudFrame, fit_plane, write_ply},
-    decode::NoiseModel,
+    decode::{AxisMap, NoiseModel},
     geometry::{
         Lens, Pose, Projector, ReadHints,
         fixtures::{rig, two_axis_rig},
