@@ -7,6 +7,7 @@ mod calibrations;
 mod document;
 mod exports;
 mod extract;
+mod linger;
 mod live;
 mod pages;
 mod problem;
@@ -213,6 +214,7 @@ async fn guard(State(app): State<App>, request: Request, next: Next) -> Response
     let checked = app.gate.check(request.method(), request.uri(), request.headers());
     let waits = request.method() == Method::GET && (path == "/v1/events" || path == "/v1/preview.mjpeg")
         || request.uri().query().is_some_and(|query| query.contains("wait="));
+    let (request, rest) = linger::Rest::of(request);
     // Those that stay have places of their own; probes are always answered.
     let place = (!waits && !is_probe).then(|| app.requests.clone().try_acquire_owned());
     let response = match (checked, place) {
@@ -222,6 +224,9 @@ async fn guard(State(app): State<App>, request: Request, next: Next) -> Response
         }
         (Ok(()), _) => next.run(request).await,
     };
+    if let Some(rest) = rest {
+        rest.take_in().await;
+    }
     app.scanner.metrics.request(&path, response.status().as_u16());
     hardened(response)
 }

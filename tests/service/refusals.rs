@@ -1,5 +1,11 @@
 //! What is not to happen: wrong requests, foreign pages, paths that lead elsewhere, tokens that do not reach.
 
+use std::{
+    io::{Read, Write},
+    net::TcpStream,
+    time::Duration,
+};
+
 use serde_json::json;
 
 use crate::{
@@ -139,6 +145,29 @@ fn pages_of_others_cannot_use_this_machine() {
     let answer = post(&[("Origin", "http://localhost:1")]).expect(202);
     assert_eq!(answer.header("access-control-allow-origin"), "");
     nothing_at_error_level(&daemon);
+}
+
+#[test]
+fn an_answer_reaches_a_client_that_is_still_sending() {
+    let daemon = Daemon::fast();
+    let slowly = |headers: &str, length: usize| {
+        let mut stream = TcpStream::connect(daemon.address()).unwrap();
+        let head = format!(
+            "POST /v1/scans HTTP/1.1\r\nConnection: close\r\nContent-Length: {length}\r\n{headers}\r\n"
+        );
+        stream.write_all(head.as_bytes()).unwrap();
+        for part in vec![b'x'; length].chunks(length.div_ceil(4)) {
+            std::thread::sleep(Duration::from_millis(20));
+            let _ = stream.write_all(part);
+        }
+        let mut answer = String::new();
+        stream.read_to_string(&mut answer).unwrap();
+        answer.split(' ').nth(1).map(str::to_owned)
+    };
+    let typed = "Content-Type: application/json\r\n";
+    assert_eq!(slowly("Host: evil.example\r\n", 40).as_deref(), Some("403"));
+    assert_eq!(slowly("Host: localhost\r\n", 40).as_deref(), Some("415"));
+    assert_eq!(slowly(&format!("Host: localhost\r\n{typed}"), 200_000).as_deref(), Some("413"));
 }
 
 #[test]
