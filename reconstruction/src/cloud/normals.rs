@@ -84,23 +84,26 @@ impl Moments {
     /// Takes over the lanes for which `take` says so.
     #[inline(always)]
     fn select(&mut self, from: &Self, take: &[bool; BLOCK]) {
-        let of_both = [
-            (&mut self.n, &from.n),
-            (&mut self.i, &from.i),
-            (&mut self.j, &from.j),
-            (&mut self.ii, &from.ii),
-            (&mut self.ij, &from.ij),
-            (&mut self.jj, &from.jj),
-            (&mut self.w, &from.w),
-            (&mut self.iw, &from.iw),
-            (&mut self.jw, &from.jw),
-        ];
-        for (own, other) in of_both {
-            for l in 0..BLOCK {
-                own[l] = if take[l] { other[l] } else { own[l] };
-            }
-        }
+        choose(&mut self.n, &from.n, take);
+        choose(&mut self.i, &from.i, take);
+        choose(&mut self.j, &from.j, take);
+        choose(&mut self.ii, &from.ii, take);
+        choose(&mut self.ij, &from.ij, take);
+        choose(&mut self.jj, &from.jj, take);
+        choose(&mut self.w, &from.w, take);
+        choose(&mut self.iw, &from.iw, take);
+        choose(&mut self.jw, &from.jw, take);
     }
+}
+
+#[inline(always)]
+fn choose(own: &mut Lanes, other: &Lanes, take: &[bool; BLOCK]) {
+    let mut chosen = *own;
+    for l in 0..BLOCK {
+        let (own, other) = (own[l], other[l]);
+        chosen[l] = if take[l] { other } else { own };
+    }
+    *own = chosen;
 }
 
 /// Lanes of a row that begin at `from`.

@@ -55,7 +55,9 @@ impl Seen {
 fn select(mask: &Mask, yes: &Lane, no: &Lane) -> Lane {
     let mut out = [0.0; LANES];
     for l in 0..LANES {
-        out[l] = if mask[l] { yes[l] } else { no[l] };
+        // Both are read first: a load that depends on the mask keeps the compiler from using vector registers.
+        let (yes, no) = (yes[l], no[l]);
+        out[l] = if mask[l] { yes } else { no };
     }
     out
 }
@@ -72,7 +74,8 @@ impl Triangulator {
             for l in 0..LANES {
                 let given = measured.sigma[axis][l];
                 let usable = given.is_finite() & (given > 0.0);
-                sigma[axis][l] = if usable { given.max(MIN_SIGMA) } else { INTEGER_SIGMA };
+                let bounded = if given > MIN_SIGMA { given } else { MIN_SIGMA };
+                sigma[axis][l] = if usable { bounded } else { INTEGER_SIGMA };
                 coded[axis][l] = pixel[axis][l].is_finite();
             }
         }
@@ -178,15 +181,14 @@ impl Triangulator {
         let t = &self.translation_mm;
         let value = select(by_column, &pixel[0], &pixel[1]);
         let of_axis = select(by_column, &q[0], &q[1]);
+        let of_projector = |column: f64, row: f64| select(by_column, &[column; LANES], &[row; LANES]);
+        let focal = of_projector(self.projector.fx, self.projector.fy);
+        let centre = of_projector(self.projector.cx, self.projector.cy);
+        let shift = of_projector(t.x, t.y);
         let mut w = [0.0; LANES];
         for l in 0..LANES {
-            let (focal, centre, shift) = if by_column[l] {
-                (self.projector.fx, self.projector.cx, t.x)
-            } else {
-                (self.projector.fy, self.projector.cy, t.y)
-            };
-            let plane = (value[l] - centre) / focal;
-            let start = (of_axis[l] - plane * q[2][l]) / (plane * t.z - shift);
+            let plane = (value[l] - centre[l]) / focal[l];
+            let start = (of_axis[l] - plane * q[2][l]) / (plane * t.z - shift[l]);
             let depth = q[2][l] + start * t.z;
             w[l] = if (depth > 0.0) & depth.is_finite() { start } else { 0.0 };
         }
