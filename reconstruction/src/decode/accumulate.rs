@@ -162,10 +162,9 @@ fn decode<T: Sample>(
     let drift = drift(&frames, &maps);
     let (boundaries, shapes) = gates::apply(&frames, &mut maps, &settings.thresholds, set);
     codes_done();
-    let mut refined = shapes
-        .iter()
-        .enumerate()
-        .map(|(index, shape)| subpixel::refine(&frames, &maps, &gates, &settings.thresholds, index, *shape));
+    let mut refined = shapes.iter().enumerate().map(|(index, shape)| {
+        subpixel::refine(&frames, &maps, &gates, &settings.thresholds, (index, *shape), set)
+    });
     let (width, height) = (settings.width, settings.height);
     let Some((column, interpolated)) = refined.next() else {
         return Err(DecodeError::Missing {

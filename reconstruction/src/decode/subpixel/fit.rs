@@ -2,7 +2,13 @@
 
 use std::ops::Range;
 
+mod lanes;
+#[cfg(test)]
+mod tests;
+
+use self::lanes::{Columns, Gap, Gaps, Parabolas};
 use super::edges::Edge;
+use crate::simd::InstructionSet;
 
 /// A depth jump: the lines of both sides disagree between two edges by more than this many projector px ...
 const MIN_JUMP: f64 = 0.6;
@@ -18,6 +24,10 @@ const WIDE: usize = 2;
 const BEND_CHI2: f64 = 4.0;
 /// Edges of the line that is left where not even a parabola fits.
 const SHORT: usize = 4;
+/// Fewest edges of a wide parabola.
+const FEWEST_WIDE: usize = 5;
+/// What arrays of edges hold beyond their end.
+const BEYOND: usize = 8;
 
 /// `u(x) = c0 + c1 t + c2 t^2`, `t = x - origin`, with the covariance of the coefficients.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -138,21 +148,32 @@ struct Windows {
     short: Range<usize>,
 }
 
+impl Windows {
+    /// Those for the interval before edge `passed` in the segment `start..end`.
+    fn around(start: usize, end: usize, passed: usize, fit_edges: usize) -> Self {
+        let of = |count| window(start, end, passed, count);
+        Self { wide: of(WIDE.saturating_mul(fit_edges)), line: of(fit_edges), short: of(SHORT) }
+    }
+}
+
 /// The best description of the edges around an interval. A parabola through twice as many edges is as precise as the
 /// line (its variance in the middle is 9/4 of that of a line through the same edges) and has no bias on curved
-/// surfaces, so it comes first where there are enough edges. Where its residuals exceed noise the window shrinks:
-/// line, parabola through the edges of the line, and where not even that fits, a short line.
-fn fit_windows(edges: &[Edge], windows: &Windows) -> Option<Fit> {
+/// surfaces, so it comes first where there are enough edges: `known` for windows of full length, which are fitted
+/// together. Where its residuals exceed noise the window shrinks: line, parabola through the edges of the line, and
+/// where not even that fits, a short line.
+fn fit_windows(
+    edges: &[Edge],
+    windows: &Windows,
+    known: impl FnOnce() -> Option<Option<Fit>>,
+) -> Option<Fit> {
     let wide = &edges[windows.wide.clone()];
     let middle = &edges[windows.line.clone()];
     if middle.len() < 2 {
         return None;
     }
-    if 4 * wide.len() >= 3 * WIDE * middle.len() && wide.len() > 4 {
-        let mut parabola = Sums::of(wide).parabola();
-        if let Some(fit) = &mut parabola
-            && !fits_badly(scale(fit, wide, 3), wide.len() - 3)
-        {
+    if 4 * wide.len() >= 3 * WIDE * middle.len() && wide.len() >= FEWEST_WIDE {
+        let parabola = known().unwrap_or_else(|| fitting_parabola(wide));
+        if parabola.is_some() {
             return parabola;
         }
     }
@@ -180,22 +201,46 @@ fn fit_windows(edges: &[Edge], windows: &Windows) -> Option<Fit> {
     nearer.or(Some(line))
 }
 
+/// Parabola through all `edges`, unless its residuals exceed noise.
+fn fitting_parabola(edges: &[Edge]) -> Option<Fit> {
+    let mut fit = Sums::of(edges).parabola()?;
+    let chi2 = scale(&mut fit, edges, 3);
+    (!fits_badly(chi2, edges.len() - 3)).then_some(fit)
+}
+
 /// Edges of one run, split where the surface jumps.
 #[derive(Debug, Default)]
 pub(super) struct Segments {
     /// Segment of each edge, as its range of edges.
     of_edge: Vec<(usize, usize)>,
     starts: Vec<usize>,
+    columns: Columns,
+    gaps: Vec<Gap>,
+    /// Parabola through a window of full length, by its first edge.
+    wide: Vec<Option<Fit>>,
+    /// Edges of that window; 0 where there is none.
+    wide_edges: usize,
+    /// Edges of a line.
+    fit_edges: usize,
 }
 
 impl Segments {
-    /// Splits `edges` at jumps.
-    pub fn split(&mut self, edges: &[Edge]) {
+    /// Splits `edges` at jumps, and fits what can be fitted together for lines of `fit_edges` edges.
+    pub fn split(&mut self, edges: &[Edge], fit_edges: usize, set: InstructionSet) {
         self.starts.clear();
         self.of_edge.clear();
+        self.columns.fill(edges);
+        self.gaps.clear();
+        self.gaps.resize(edges.len(), Gap::Unknown);
+        set.run(Gaps { edges: &self.columns, out: &mut self.gaps });
         let mut start = 0;
         for next in 1..edges.len() {
-            if jumps(edges, start, next) {
+            let jumps = match self.gaps[next] {
+                Gap::Even if next - start >= JUMP_EDGES => false,
+                Gap::Jump if next - start >= JUMP_EDGES => true,
+                _ => jumps(edges, start, next),
+            };
+            if jumps {
                 self.starts.push(start);
                 start = next;
             }
@@ -207,19 +252,37 @@ impl Segments {
             let end = self.starts.get(index + 1).copied().unwrap_or(edges.len());
             self.of_edge.extend((start..end).map(|_| (start, end)));
         }
+        self.fit_edges = fit_edges;
+        self.fit_wide(edges, set);
     }
 
-    /// Fits for pixels after `passed` edges: one where both neighbouring edges belong to one segment, else one of
+    /// Fits the parabolas through windows of full length.
+    fn fit_wide(&mut self, edges: &[Edge], set: InstructionSet) {
+        let count = WIDE.saturating_mul(self.fit_edges);
+        self.wide_edges = if (FEWEST_WIDE..=edges.len()).contains(&count) { count } else { 0 };
+        if self.wide_edges == 0 {
+            return;
+        }
+        self.wide.resize(edges.len(), None);
+        for (index, &first) in self.starts.iter().enumerate() {
+            let end = self.starts.get(index + 1).copied().unwrap_or(edges.len());
+            set.run(Parabolas { edges: &self.columns, first, end, count, out: &mut self.wide });
+        }
+    }
+
+    /// The parabola through a window, if windows like it were fitted together.
+    fn known(&self, window: &Range<usize>) -> Option<Option<Fit>> {
+        (window.len() == self.wide_edges).then(|| self.wide.get(window.start).copied()).flatten()
+    }
+
+    /// Fits for pixels after `passed` of the `edges` that were split: one where both neighbouring edges belong to one segment, else one of
     /// each side.
-    pub fn fits(&self, edges: &[Edge], passed: usize, fit_edges: usize) -> [Option<Fit>; 2] {
+    pub fn fits(&self, edges: &[Edge], passed: usize) -> [Option<Fit>; 2] {
         let before = passed.checked_sub(1).and_then(|edge| self.of_edge.get(edge)).copied();
         let after = self.of_edge.get(passed).copied();
         let fit = |(start, end): (usize, usize)| {
-            let of = |count| window(start, end, passed, count);
-            fit_windows(
-                edges,
-                &Windows { wide: of(WIDE.saturating_mul(fit_edges)), line: of(fit_edges), short: of(SHORT) },
-            )
+            let windows = Windows::around(start, end, passed, self.fit_edges);
+            fit_windows(edges, &windows, || self.known(&windows.wide))
         };
         match (before, after) {
             (Some(before), Some(after)) if before == after => [fit(before), None],
@@ -261,31 +324,5 @@ fn jumps(edges: &[Edge], start: usize, next: usize) -> bool {
         (Some(left), None) => disagree(left.at(edges[next].position), (edges[next].u, 0.0)),
         (None, Some(right)) => disagree(right.at(edges[next - 1].position), (edges[next - 1].u, 0.0)),
         (None, None) => false,
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn any_number_of_edges_can_be_asked_for() {
-        let edges: Vec<Edge> = (0..12)
-            .map(|index| Edge {
-                position: 3.0 * f64::from(index),
-                weight: 100.0,
-                u: f64::from(index) + 0.5,
-                rising: index % 2 == 0,
-            })
-            .collect();
-        let mut segments = Segments::default();
-        segments.split(&edges);
-        for passed in 0..=edges.len() {
-            let all = segments.fits(&edges, passed, edges.len());
-            assert!(all.iter().any(Option::is_some));
-            for many in [usize::MAX, usize::MAX / 2 + 1, usize::MAX - 3] {
-                assert_eq!(segments.fits(&edges, passed, many), all);
-            }
-        }
     }
 }

@@ -26,7 +26,7 @@ use super::{
     types::{AxisMap, Class, Thresholds},
     words::PixelMaps,
 };
-use crate::grid::Grid;
+use crate::{grid::Grid, simd::InstructionSet};
 
 /// Lines of one task: neighbours share cache lines where lines run along y.
 const LINES_PER_TASK: usize = 16;
@@ -60,8 +60,8 @@ pub(crate) fn refine<T: Sample>(
     maps: &PixelMaps,
     gates: &Gates,
     thresholds: &Thresholds,
-    index: usize,
-    shape: AxisShape,
+    (index, shape): (usize, AxisShape),
+    set: InstructionSet,
 ) -> (AxisMap, Vec<bool>) {
     let (width, height) = (frames.width, frames.height);
     let code = frames.axes[index].code;
@@ -91,7 +91,7 @@ pub(crate) fn refine<T: Sample>(
                 let mut out = (coordinate, sigma, between);
                 fill_codes(&finder, line, &mut out);
                 if fitted {
-                    fill_fits(&finder, line, thresholds.fit_edges, scratch, &mut out);
+                    fill_fits(&finder, line, (thresholds.fit_edges, set), scratch, &mut out);
                 }
             }
         });
@@ -159,14 +159,14 @@ fn fill_codes<T: Sample>(finder: &EdgeFinder<'_, T>, line: Line, (coordinate, si
 fn fill_fits<T: Sample>(
     finder: &EdgeFinder<'_, T>,
     line: Line,
-    fit_edges: usize,
+    (fit_edges, set): (usize, InstructionSet),
     scratch: &mut Scratch,
     (coordinate, sigma, between): &mut LineOut<'_>,
 ) {
     finder.find(line, &mut scratch.edges, &mut scratch.runs);
     for run in &scratch.runs {
         let edges = &scratch.edges[run.edges.clone()];
-        scratch.segments.split(edges);
+        scratch.segments.split(edges, fit_edges, set);
         let mut passed = 0;
         let mut known = usize::MAX;
         let mut fits: [Option<Fit>; 2] = [None; 2];
@@ -177,7 +177,7 @@ fn fill_fits<T: Sample>(
             let at = line.at(position);
             let Some(value) = finder.value(at) else { continue };
             if known != passed {
-                fits = scratch.segments.fits(edges, passed, fit_edges);
+                fits = scratch.segments.fits(edges, passed);
                 known = passed;
             }
             let centre = finder.code.boundary(value) - 0.5;
