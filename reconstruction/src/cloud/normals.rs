@@ -4,6 +4,8 @@
 //! Neighbouring pixels of a row are handled together, one to a lane of vector registers. Each lane does what
 //! `plain::normal_at` does, in the same order.
 
+#![allow(clippy::needless_range_loop, reason = "one index counts the lanes of several arrays")]
+
 use rayon::prelude::*;
 
 use super::surface::{BLOCK, JUMP_SIGMAS, MARGIN, STEEPEST, Surface};
@@ -55,8 +57,8 @@ fn strides(surface: &Surface<'_>, here: &Lanes, sigma: &Lanes) -> [u8; BLOCK] {
         // Slope noise of a window of stride 1 is sigma_z / (z * pitch * gain) = sigma_w / (w * pitch * gain).
         let noise = sigma[l] / (here[l] * surface.pitch * WINDOW_GAIN);
         // Noise that is no number asks for the widest.
-        let wider = u8::from(!(noise <= WANTED_SLOPE_SIGMA)) + u8::from(!(noise <= 2.0 * WANTED_SLOPE_SIGMA));
-        strides[l] = if here[l].is_finite() { 1 + wider } else { 0 };
+        let narrower = u8::from(noise <= WANTED_SLOPE_SIGMA) + u8::from(noise <= 2.0 * WANTED_SLOPE_SIGMA);
+        strides[l] = if here[l].is_finite() { MAX_STRIDE - narrower } else { 0 };
     }
     strides
 }
@@ -192,7 +194,7 @@ fn fit(sums: &Moments, here: &Lanes, stride: &[u8; BLOCK]) -> Planes {
         let determinant = ii * jj - ij * ij;
         let mean = 0.5 * (ii + jj);
         // Samples nearly on a line fix the slope along it only.
-        let spans = !(determinant < 0.05 * (mean * mean)) & !(determinant < 1e-3);
+        let spans = (determinant >= 0.05 * (mean * mean)) & (determinant >= 1e-3);
         planes.found[l] = (sums.n[l] >= MIN_SAMPLES) & spans;
         let along_x = (iw * jj - jw * ij) / determinant;
         let along_y = (jw * ii - iw * ij) / determinant;

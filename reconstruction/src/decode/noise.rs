@@ -6,6 +6,8 @@
 //! compared with that a few pixels on. Outliers: spread is read from quantiles. The line `read^2 + K * level` is then
 //! fitted over bins of level.
 
+use rayon::prelude::*;
+
 use super::{plan::Frames, sample::Sample, types::NoiseModel};
 
 /// Distance in px over which slow differences are cancelled; a multiple of the common block of image compression.
@@ -13,6 +15,8 @@ const PARTNER: usize = 8;
 /// Rows that are looked at.
 const ROWS: usize = 160;
 const LEVEL_BINS: usize = 48;
+/// Parts of the sources that are looked at side by side.
+const PARTS: usize = 4;
 /// Fewer samples in a bin say nothing.
 const MIN_SAMPLES: u64 = 400;
 
@@ -26,8 +30,7 @@ struct Source<'a, T> {
 struct Spread {
     step: i32,
     half: usize,
-    full_scale: f64,
-    counts: Vec<u64>,
+    counts: Vec<u32>,
     level_sums: Vec<f64>,
     totals: Vec<u64>,
 }
@@ -39,23 +42,26 @@ impl Spread {
         Self {
             step,
             half,
-            full_scale: f64::from(1u32 << bit_depth),
             counts: vec![0; LEVEL_BINS * (2 * half + 1)],
             level_sums: vec![0.0; LEVEL_BINS],
             totals: vec![0; LEVEL_BINS],
         }
     }
 
-    /// `difference` of two sums of two frames each pair; `level` of one frame above black.
-    fn add(&mut self, level: f64, difference: i32) {
-        // Square root spacing: shot noise makes dark bins the informative ones.
-        let share = (level.max(0.0) / self.full_scale).min(1.0).sqrt();
-        let bin = ((share * LEVEL_BINS as f64) as usize).min(LEVEL_BINS - 1);
+    /// `difference` of two sums of two frames each pair; `level` of one frame above black, and its bin.
+    fn add(&mut self, (bin, level): (usize, f64), difference: i32) {
         let half = self.half as i32;
         let at = (difference.div_euclid(self.step)).clamp(-half, half) + half;
         self.counts[bin * (2 * self.half + 1) + at as usize] += 1;
-        self.level_sums[bin] += level.max(0.0);
+        self.level_sums[bin] += level;
         self.totals[bin] += 1;
+    }
+
+    fn join(mut self, other: Self) -> Self {
+        self.counts.iter_mut().zip(other.counts).for_each(|(sum, more)| *sum += more);
+        self.level_sums.iter_mut().zip(other.level_sums).for_each(|(sum, more)| *sum += more);
+        self.totals.iter_mut().zip(other.totals).for_each(|(sum, more)| *sum += more);
+        self
     }
 
     /// Level, variance of one frame and its relative accuracy for each bin that has enough samples.
@@ -78,11 +84,36 @@ impl Spread {
     }
 }
 
+/// Bin and level above black of a sum of eight samples.
+struct Levels {
+    black_level_dn: f64,
+    bins: Vec<u8>,
+}
+
+impl Levels {
+    fn new(bit_depth: u8, black_level_dn: f64) -> Self {
+        let full_scale = f64::from(1u32 << bit_depth);
+        let bin = |sum: u32| {
+            let level = f64::from(sum) / 8.0 - black_level_dn;
+            // Square root spacing: shot noise makes dark bins the informative ones.
+            let share = (level.max(0.0) / full_scale).min(1.0).sqrt();
+            ((share * LEVEL_BINS as f64) as usize).min(LEVEL_BINS - 1) as u8
+        };
+        Self { black_level_dn, bins: (0..8u32 << bit_depth).map(bin).collect() }
+    }
+
+    /// `None` for a sum of what the bit depth does not allow.
+    fn of(&self, sum: i32) -> Option<(usize, f64)> {
+        let bin = *self.bins.get(usize::try_from(sum).ok()?)?;
+        Some((usize::from(bin), (f64::from(sum) / 8.0 - self.black_level_dn).max(0.0)))
+    }
+}
+
 /// Position in steps below which `rank` of the counts lie, each count spread evenly over its step.
-fn quantile(counts: &[u64], rank: f64) -> f64 {
+fn quantile(counts: &[u32], rank: f64) -> f64 {
     let mut below = 0.0;
     for (index, &count) in counts.iter().enumerate() {
-        let count = count as f64;
+        let count = f64::from(count);
         if below + count >= rank && count > 0.0 {
             return index as f64 + (rank - below) / count;
         }
@@ -136,34 +167,53 @@ fn from_sources<T: Sample>(
     saturation_dn: u16,
 ) -> Option<NoiseModel> {
     let height = sources.first()?.first[0].len().checked_div(width)?;
-    let mut spread = Spread::new(bit_depth);
     // A repeated reference is handed in as both planes of its source: its difference counts twice, its variance four times.
     let twice = std::ptr::eq(sources[0].first[0], sources[0].first[1]);
-    let saturation = i32::from(saturation_dn);
+    let levels = Levels::new(bit_depth, black_level_dn);
+    // Parts that do not depend on the number of threads are added in their order: so the sums do not either.
+    let parts: Vec<Spread> = sources
+        .par_chunks(sources.len().div_ceil(PARTS))
+        .map(|sources| {
+            let mut spread = Spread::new(bit_depth);
+            for source in sources {
+                add_source(&mut spread, source, (width, height), &levels, i32::from(saturation_dn));
+            }
+            spread
+        })
+        .collect();
+    let spread = parts.into_iter().reduce(Spread::join)?;
+    fit(&spread.variances(if twice { 16.0 } else { 8.0 }))
+}
+
+fn add_source<T: Sample>(
+    spread: &mut Spread,
+    source: &Source<'_, T>,
+    (width, height): (usize, usize),
+    levels: &Levels,
+    saturation: i32,
+) {
     let stride = (height / ROWS).max(1);
-    for source in sources {
-        for y in (stride / 2..height).step_by(stride) {
-            let row =
-                |plane: &'_ [T]| -> Vec<i32> { plane[y * width..][..width].iter().map(|s| s.dn()).collect() };
-            let planes = [source.first[0], source.first[1], source.second[0], source.second[1]].map(row);
-            let sums = |x: usize| {
-                let values = [0, 1, 2, 3].map(|plane: usize| planes[plane][x]);
-                let clipped = values.iter().any(|&value| value >= saturation || value <= 0);
-                (!clipped).then_some((values[0] + values[1], values[2] + values[3]))
-            };
-            for x in 0..width.saturating_sub(PARTNER) {
-                let (Some(here), Some(there)) = (sums(x), sums(x + PARTNER)) else { continue };
-                let levels = [here.0 + here.1, there.0 + there.1];
-                // Very different levels carry their stray light differently and belong into no common bin.
-                if (levels[0] - levels[1]).abs() > (levels[0] + levels[1]) / 8 {
-                    continue;
-                }
-                let level = f64::from(levels[0] + levels[1]) / 8.0 - black_level_dn;
+    for y in (stride / 2..height).step_by(stride) {
+        let row =
+            |plane: &'_ [T]| -> Vec<i32> { plane[y * width..][..width].iter().map(|s| s.dn()).collect() };
+        let planes = [source.first[0], source.first[1], source.second[0], source.second[1]].map(row);
+        let sums = |x: usize| {
+            let values = [0, 1, 2, 3].map(|plane: usize| planes[plane][x]);
+            let clipped = values.iter().any(|&value| value >= saturation || value <= 0);
+            (!clipped).then_some((values[0] + values[1], values[2] + values[3]))
+        };
+        for x in 0..width.saturating_sub(PARTNER) {
+            let (Some(here), Some(there)) = (sums(x), sums(x + PARTNER)) else { continue };
+            let sums = [here.0 + here.1, there.0 + there.1];
+            // Very different levels carry their stray light differently and belong into no common bin.
+            if (sums[0] - sums[1]).abs() > (sums[0] + sums[1]) / 8 {
+                continue;
+            }
+            if let Some(level) = levels.of(sums[0] + sums[1]) {
                 spread.add(level, (here.0 - here.1) - (there.0 - there.1));
             }
         }
     }
-    fit(&spread.variances(if twice { 16.0 } else { 8.0 }))
 }
 
 /// `read^2 + 1/12 + K * level` by weighted least squares, both terms kept from going negative.

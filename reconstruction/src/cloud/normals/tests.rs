@@ -45,7 +45,8 @@ fn breaks(points: &Grid<[f32; 3]>, sigma_z: &Grid<f32>, pitch: f32, x: usize, y:
         for i in x.saturating_sub(1)..=(x + 1).min(width - 1) {
             let (other, of_other) = read(i, j);
             let limit = w * pitch * STEEPEST * 1.5 + JUMP_SIGMAS * (sigma + of_other);
-            broken |= (i, j) != (x, y) && !((w - other).abs() <= limit);
+            let connected = (w - other).abs() <= limit;
+            broken |= (i, j) != (x, y) && !connected;
         }
     }
     w.is_finite() && broken

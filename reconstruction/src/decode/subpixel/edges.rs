@@ -72,6 +72,77 @@ pub(super) struct Run {
     pub edges: Range<usize>,
 }
 
+/// A walk along a line, and what was found on the way.
+#[derive(Debug, Default)]
+pub(super) struct Walk {
+    /// Value of each pixel; -1 where it is not valid.
+    pub values: Vec<i32>,
+    pub classes: Vec<Class>,
+    /// In order.
+    pub runs: Vec<Run>,
+    pub edges: Vec<Edge>,
+    /// Last valid pixel and its value.
+    last: Option<(usize, i32)>,
+    first_pixel: usize,
+    first_edge: usize,
+}
+
+impl Walk {
+    fn begin<T: Sample>(&mut self, line: Line, finder: &EdgeFinder<'_, T>) {
+        self.values.clear();
+        self.classes.clear();
+        self.runs.clear();
+        self.edges.clear();
+        (self.last, self.first_pixel, self.first_edge) = (None, 0, 0);
+        let (values, classes) = (&finder.values[line.start..], &finder.maps.class[line.start..]);
+        let known = |value: i32, class: Class| if class.is_valid() { value } else { -1 };
+        if line.stride == 1 {
+            let pixels = values.iter().zip(classes).take(line.len);
+            self.values.extend(pixels.map(|(value, class)| known(*value, *class)));
+            self.classes.extend_from_slice(&classes[..line.len]);
+        } else {
+            let pixels = values.iter().zip(classes).step_by(line.stride).take(line.len);
+            self.values.extend(pixels.map(|(value, class)| known(*value, *class)));
+            self.classes.extend(classes.iter().step_by(line.stride).take(line.len));
+        }
+    }
+
+    fn step<T: Sample>(&mut self, finder: &EdgeFinder<'_, T>, line: Line, position: usize) {
+        let value = self.values[position];
+        if value < 0 {
+            return;
+        }
+        match self.last {
+            Some((before, previous))
+                if position - before <= MAX_GAP + 1
+                    && value.abs_diff(previous) as usize <= finder.step as usize * (position - before) =>
+            {
+                if position == before + 1 && value != previous {
+                    finder.push_crossings(line, before, (previous, value), &mut self.edges);
+                }
+            }
+            Some((before, _)) => {
+                self.close_run(before);
+                (self.first_pixel, self.first_edge) = (position, self.edges.len());
+            }
+            None => self.first_pixel = position,
+        }
+        self.last = Some((position, value));
+    }
+
+    fn close_run(&mut self, last_pixel: usize) {
+        join(&mut self.edges, self.first_edge);
+        self.runs
+            .push(Run { pixels: self.first_pixel..last_pixel + 1, edges: self.first_edge..self.edges.len() });
+    }
+
+    fn end(&mut self) {
+        if let Some((before, _)) = self.last {
+            self.close_run(before);
+        }
+    }
+}
+
 /// How an edge is measured.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum EdgeForm {
@@ -146,10 +217,6 @@ impl<'a, T: Sample> EdgeFinder<'a, T> {
         (self.maps.class[at].is_valid() && self.values[at] >= 0).then(|| self.values[at])
     }
 
-    pub fn class(&self, at: usize) -> Class {
-        self.maps.class[at]
-    }
-
     /// Normalised fringe of `bit` and its variance; `None` where a frame is saturated, which would bias the edge.
     fn fringe(&self, bit: u8, at: usize) -> Option<(f64, f64)> {
         let full = self.gates.saturation_dn;
@@ -207,37 +274,16 @@ impl<'a, T: Sample> EdgeFinder<'a, T> {
         }
     }
 
-    /// Runs and edges of a line, in order.
-    pub fn find(&self, line: Line, edges: &mut Vec<Edge>, runs: &mut Vec<Run>) {
-        edges.clear();
-        runs.clear();
-        let mut last: Option<(usize, i32)> = None;
-        let mut first_pixel = 0;
-        let mut first_edge = 0;
-        for position in 0..line.len {
-            let Some(value) = self.value(line.at(position)) else { continue };
-            match last {
-                Some((before, previous))
-                    if position - before <= MAX_GAP + 1
-                        && value.abs_diff(previous) as usize <= self.step as usize * (position - before) =>
-                {
-                    if position == before + 1 && value != previous {
-                        self.push_crossings(line, before, (previous, value), edges);
-                    }
-                }
-                Some((before, _)) => {
-                    close_run(edges, first_edge);
-                    runs.push(Run { pixels: first_pixel..before + 1, edges: first_edge..edges.len() });
-                    (first_pixel, first_edge) = (position, edges.len());
-                }
-                None => first_pixel = position,
+    /// Walks along neighbouring lines at once, so that lines across the rows of the image share what is loaded.
+    pub fn walk(&self, lines: &[Line], walks: &mut [Walk]) {
+        lines.iter().zip(&mut *walks).for_each(|(line, walk)| walk.begin(*line, self));
+        let len = lines.first().map_or(0, |line| line.len);
+        for position in 0..len {
+            for (line, walk) in lines.iter().zip(&mut *walks) {
+                walk.step(self, *line, position);
             }
-            last = Some((position, value));
         }
-        if let Some((before, _)) = last {
-            close_run(edges, first_edge);
-            runs.push(Run { pixels: first_pixel..before + 1, edges: first_edge..edges.len() });
-        }
+        walks.iter_mut().for_each(Walk::end);
     }
 
     /// Edges between two neighbouring pixels whose values differ.
@@ -319,7 +365,7 @@ fn straightened(a: f64) -> (f64, f64) {
 
 /// Joins what noise has multiplied: the crossings of one boundary in a row count as one, `x1 - x2 + x3`, or as none
 /// where they cancel.
-fn close_run(edges: &mut Vec<Edge>, first: usize) {
+fn join(edges: &mut Vec<Edge>, first: usize) {
     let mut kept = first;
     let mut at = first;
     while at < edges.len() {

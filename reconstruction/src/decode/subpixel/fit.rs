@@ -1,6 +1,6 @@
 //! Local fits of the projector coordinate through the edges of one surface.
 
-use std::ops::Range;
+use std::{borrow::Cow, ops::Range};
 
 mod lanes;
 #[cfg(test)]
@@ -161,22 +161,31 @@ impl Windows {
 /// surfaces, so it comes first where there are enough edges: `known` for windows of full length, which are fitted
 /// together. Where its residuals exceed noise the window shrinks: line, parabola through the edges of the line, and
 /// where not even that fits, a short line.
-fn fit_windows(
+fn fit_windows<'a>(
     edges: &[Edge],
     windows: &Windows,
-    known: impl FnOnce() -> Option<Option<Fit>>,
-) -> Option<Fit> {
+    known: impl FnOnce() -> Option<&'a Option<Fit>>,
+) -> Option<Cow<'a, Fit>> {
     let wide = &edges[windows.wide.clone()];
     let middle = &edges[windows.line.clone()];
     if middle.len() < 2 {
         return None;
     }
     if 4 * wide.len() >= 3 * WIDE * middle.len() && wide.len() >= FEWEST_WIDE {
-        let parabola = known().unwrap_or_else(|| fitting_parabola(wide));
+        let parabola = match known() {
+            Some(known) => known.as_ref().map(Cow::Borrowed),
+            None => fitting_parabola(wide).map(Cow::Owned),
+        };
         if parabola.is_some() {
             return parabola;
         }
     }
+    fit_closely(edges, windows).map(Cow::Owned)
+}
+
+/// A line, or what comes after it.
+fn fit_closely(edges: &[Edge], windows: &Windows) -> Option<Fit> {
+    let middle = &edges[windows.line.clone()];
     let sums = Sums::of(middle);
     let mut line = sums.line()?;
     let of_line = scale(&mut line, middle, 2);
@@ -271,13 +280,13 @@ impl Segments {
     }
 
     /// The parabola through a window, if windows like it were fitted together.
-    fn known(&self, window: &Range<usize>) -> Option<Option<Fit>> {
-        (window.len() == self.wide_edges).then(|| self.wide.get(window.start).copied()).flatten()
+    fn known(&self, window: &Range<usize>) -> Option<&Option<Fit>> {
+        if window.len() == self.wide_edges { self.wide.get(window.start) } else { None }
     }
 
     /// Fits for pixels after `passed` of the `edges` that were split: one where both neighbouring edges belong to one segment, else one of
     /// each side.
-    pub fn fits(&self, edges: &[Edge], passed: usize) -> [Option<Fit>; 2] {
+    pub fn fits(&self, edges: &[Edge], passed: usize) -> [Option<Cow<'_, Fit>>; 2] {
         let before = passed.checked_sub(1).and_then(|edge| self.of_edge.get(edge)).copied();
         let after = self.of_edge.get(passed).copied();
         let fit = |(start, end): (usize, usize)| {

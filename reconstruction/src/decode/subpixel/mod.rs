@@ -11,17 +11,19 @@ mod degree;
 mod edges;
 mod fit;
 
+use std::borrow::Cow;
+
 use polscan_patterns::Mode;
 use rayon::prelude::*;
 
 use self::{
-    edges::{Edge, EdgeFinder, EdgeForm, Line, Run},
+    edges::{Edge, EdgeFinder, EdgeForm, Line, Walk},
     fit::{Fit, Segments},
 };
 use super::{
     gates::AxisShape,
     limits::Gates,
-    plan::Frames,
+    plan::{Frames, PrefixCode},
     sample::Sample,
     types::{AxisMap, Class, Thresholds},
     words::PixelMaps,
@@ -29,7 +31,7 @@ use super::{
 use crate::{grid::Grid, simd::InstructionSet};
 
 /// Lines of one task: neighbours share cache lines where lines run along y.
-const LINES_PER_TASK: usize = 16;
+const LINES_PER_TASK: usize = 32;
 /// Lines that blur and the systematic error of edges are measured on.
 const SAMPLED_LINES: usize = 120;
 /// How far a coordinate may lie from the centre of its code, in projector px: half a pixel, and as much again for the
@@ -49,8 +51,7 @@ type LineOut<'a> = (&'a mut [f32], &'a mut [f32], &'a mut [bool]);
 /// What the finder and the fits share on one thread.
 #[derive(Default)]
 struct Scratch {
-    edges: Vec<Edge>,
-    runs: Vec<Run>,
+    walks: Vec<Walk>,
     segments: Segments,
 }
 
@@ -85,13 +86,20 @@ pub(crate) fn refine<T: Sample>(
         .zip(between.par_chunks_mut(size))
         .enumerate()
         .for_each_init(Scratch::default, |scratch, (task, ((coordinate, sigma), between))| {
-            let lines = coordinate.chunks_mut(len).zip(sigma.chunks_mut(len)).zip(between.chunks_mut(len));
-            for (number, ((coordinate, sigma), between)) in lines.enumerate() {
-                let line = line(task * LINES_PER_TASK + number);
+            let numbers = task * LINES_PER_TASK..(task * LINES_PER_TASK + coordinate.len() / len);
+            let lines: Vec<Line> = numbers.map(line).collect();
+            scratch.walks.resize_with(lines.len(), Walk::default);
+            // Lines along rows follow each other in memory as they are.
+            let together = if shape.along_y { lines.len() } else { 1 };
+            for (lines, walks) in lines.chunks(together).zip(scratch.walks.chunks_mut(together)) {
+                finder.walk(lines, walks);
+            }
+            let out = coordinate.chunks_mut(len).zip(sigma.chunks_mut(len)).zip(between.chunks_mut(len));
+            for (walk, ((coordinate, sigma), between)) in scratch.walks.iter().zip(out) {
                 let mut out = (coordinate, sigma, between);
-                fill_codes(&finder, line, &mut out);
+                fill_codes(code, walk, &mut out);
                 if fitted {
-                    fill_fits(&finder, line, (thresholds.fit_edges, set), scratch, &mut out);
+                    fill_fits(code, walk, (thresholds.fit_edges, set), &mut scratch.segments, &mut out);
                 }
             }
         });
@@ -128,72 +136,74 @@ fn calibrate<T: Sample>(finder: &mut EdgeFinder<'_, T>, lines: usize, line: impl
         Mode::Paper => EdgeForm::ThreeLines,
         _ => EdgeForm::for_slopes(&mut slopes),
     };
-    let mut scratch = Scratch::default();
+    let mut walk = [Walk::default()];
     let mut triples = Vec::new();
     for number in sampled {
-        finder.find(line(number), &mut scratch.edges, &mut scratch.runs);
-        for run in &scratch.runs {
-            edges::straightness(&scratch.edges[run.edges.clone()], &mut triples);
+        finder.walk(&[line(number)], &mut walk);
+        let [walk] = &walk;
+        for run in &walk.runs {
+            edges::straightness(&walk.edges[run.edges.clone()], &mut triples);
         }
     }
     finder.floor = edges::systematic_variance(&mut triples);
 }
 
 /// The centre of the code's span at each valid pixel.
-fn fill_codes<T: Sample>(finder: &EdgeFinder<'_, T>, line: Line, (coordinate, sigma, _): &mut LineOut<'_>) {
-    for position in 0..line.len {
-        if let Some((first, last)) = finder.value(line.at(position)).and_then(|value| finder.code.span(value))
-        {
-            let of_code = if finder.class(line.at(position)) == Class::Edge {
-                EDGE_CODE_VARIANCE
-            } else {
-                CODE_VARIANCE
-            };
-            coordinate[position] = (first + last) as f32 / 2.0;
-            sigma[position] = (f64::from(last - first + 1) * of_code.sqrt()) as f32;
+fn fill_codes(code: PrefixCode, walk: &Walk, (coordinate, sigma, _): &mut LineOut<'_>) {
+    let (of_code, of_edge) = (CODE_VARIANCE.sqrt(), EDGE_CODE_VARIANCE.sqrt());
+    let pixels = walk.values.iter().zip(&walk.classes);
+    for ((&value, class), (coordinate, sigma)) in pixels.zip(coordinate.iter_mut().zip(sigma.iter_mut())) {
+        if value < 0 {
+            continue;
+        }
+        if let Some((first, last)) = code.span(value) {
+            *coordinate = (first + last) as f32 / 2.0;
+            let of_code = if *class == Class::Edge { of_edge } else { of_code };
+            *sigma = (f64::from(last - first + 1) * of_code) as f32;
         }
     }
 }
 
 /// Fits along one line wherever there are edges.
-fn fill_fits<T: Sample>(
-    finder: &EdgeFinder<'_, T>,
-    line: Line,
+fn fill_fits(
+    code: PrefixCode,
+    walk: &Walk,
     (fit_edges, set): (usize, InstructionSet),
-    scratch: &mut Scratch,
+    segments: &mut Segments,
     (coordinate, sigma, between): &mut LineOut<'_>,
 ) {
-    finder.find(line, &mut scratch.edges, &mut scratch.runs);
-    for run in &scratch.runs {
-        let edges = &scratch.edges[run.edges.clone()];
-        scratch.segments.split(edges, fit_edges, set);
+    for run in &walk.runs {
+        let edges = &walk.edges[run.edges.clone()];
+        segments.split(edges, fit_edges, set);
         let mut passed = 0;
         let mut known = usize::MAX;
-        let mut fits: [Option<Fit>; 2] = [None; 2];
+        let mut fits: [Option<Cow<'_, Fit>>; 2] = [None, None];
         for position in run.pixels.clone() {
-            while passed < edges.len() && edges[passed].position <= position as f64 {
+            let place = position as f64;
+            while passed < edges.len() && edges[passed].position <= place {
                 passed += 1;
             }
-            let at = line.at(position);
-            let Some(value) = finder.value(at) else { continue };
+            let value = walk.values[position];
+            if value < 0 {
+                continue;
+            }
             if known != passed {
-                fits = scratch.segments.fits(edges, passed);
+                fits = segments.fits(edges, passed);
                 known = passed;
             }
-            let centre = finder.code.boundary(value) - 0.5;
-            let (limit, of_code) = match finder.class(at) {
+            let centre = code.boundary(value) - 0.5;
+            let (limit, of_code) = match walk.classes[position] {
                 Class::Edge => (MAX_OFF_EDGE, EDGE_CODE_VARIANCE),
                 _ => (MAX_OFF_CODE, CODE_VARIANCE),
             };
             let best = fits
                 .iter()
                 .flatten()
-                .map(|fit| fit.at(position as f64))
+                .map(|fit| fit.at(place))
                 .filter(|&(u, variance)| (u - centre).abs() <= limit && variance > 0.0 && variance < of_code)
                 .min_by(|a, b| (a.0 - centre).abs().total_cmp(&(b.0 - centre).abs()));
             let Some((u, variance)) = best else { continue };
-            let near =
-                |edge: Option<&Edge>| edge.is_some_and(|e| (e.position - position as f64).abs() <= AT_EDGE);
+            let near = |edge: Option<&Edge>| edge.is_some_and(|e| (e.position - place).abs() <= AT_EDGE);
             coordinate[position] = u as f32;
             sigma[position] = variance.sqrt() as f32;
             between[position] =

@@ -1,6 +1,8 @@
 //! [`Triangulator::solve`] for neighbouring pixels of a row at once, one to a lane of vector registers. Each lane does the
 //! same operations in the same order, so that results are equal to the bit.
 
+#![allow(clippy::needless_range_loop, reason = "one index counts the lanes of several arrays")]
+
 use super::{INTEGER_SIGMA, MAX_STEPS, MIN_INVERSE_DEPTH, MIN_SIGMA, STEP_TOLERANCE, Triangulator};
 
 /// Pixels that are solved together.
@@ -112,7 +114,7 @@ impl Triangulator {
             row_error_sigma_px: zero,
         };
         for l in 0..LANES {
-            let ahead = !(q[2][l] + w[l] * t.z <= 0.0);
+            let ahead = q[2][l] + w[l] * t.z > 0.0;
             out.found[l] = found[l] & (w[l] > MIN_INVERSE_DEPTH) & (information[l] > 0.0) & ahead;
             let z = 1.0 / w[l];
             out.point_mm[0][l] = dx[l] * z;

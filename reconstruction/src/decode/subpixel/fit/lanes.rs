@@ -1,6 +1,8 @@
 //! Fits through windows that begin at neighbouring edges, one to a lane of vector registers. Each lane does what the
 //! functions for one window do, in the same order, so that results are equal to the bit.
 
+#![allow(clippy::needless_range_loop, reason = "one index counts the lanes of several arrays")]
+
 use super::{BEYOND, Edge, Fit, JUMP_EDGES, JUMP_SIGMA, MIN_JUMP, MISFIT};
 use crate::simd::Work;
 
@@ -167,7 +169,7 @@ fn parabolas(edges: &Columns, first: usize, count: usize) -> (Fits, [bool; LANES
         let share = chi2 / freedom;
         let excess = if share > 1.0 { share } else { 1.0 };
         scale[l] = slope * slope * excess;
-        found[l] &= !(chi2 > limit);
+        found[l] &= (chi2 <= limit) | chi2.is_nan();
     }
     for entry in 0..6 {
         for l in 0..LANES {

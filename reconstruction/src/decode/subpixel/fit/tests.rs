@@ -26,7 +26,7 @@ fn edges(seed: u64, count: usize) -> Vec<Edge> {
 }
 
 /// What [`Segments`] gives, made window by window: the segment of each edge, and the fits before it.
-fn plainly(edges: &[Edge], fit_edges: usize) -> Vec<[Option<Fit>; 2]> {
+fn plainly(edges: &[Edge], fit_edges: usize) -> Vec<[Option<Cow<'static, Fit>>; 2]> {
     let mut starts = vec![0];
     for next in 1..edges.len() {
         if jumps(edges, starts[starts.len() - 1], next) {
@@ -52,8 +52,8 @@ fn plainly(edges: &[Edge], fit_edges: usize) -> Vec<[Option<Fit>; 2]> {
         .collect()
 }
 
-fn bits(fit: &Option<Fit>) -> Option<Vec<u64>> {
-    fit.map(|fit| {
+fn bits(fit: &Option<Cow<'_, Fit>>) -> Option<Vec<u64>> {
+    fit.as_ref().map(|fit| {
         let numbers = [fit.origin].into_iter().chain(fit.coefficients).chain(fit.covariance);
         numbers.map(f64::to_bits).collect()
     })
@@ -91,7 +91,7 @@ fn any_number_of_edges_can_be_asked_for() {
     for passed in 0..=edges.len() {
         let mut asked_for = |many| {
             segments.split(&edges, many, InstructionSet::widest());
-            segments.fits(&edges, passed)
+            segments.fits(&edges, passed).map(|fit| fit.map(Cow::into_owned))
         };
         let all = asked_for(edges.len());
         assert!(all.iter().any(Option::is_some));
