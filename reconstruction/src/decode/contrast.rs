@@ -8,7 +8,10 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::{sample::Sample, types::Plane};
-use crate::grid::Grid;
+use crate::{
+    grid::Grid,
+    simd::{InstructionSet, Work},
+};
 
 /// Contrast as mean squared grey difference, grey levels 0..=255, mean over the code frames.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -43,14 +46,159 @@ pub fn contrast(
     }
 }
 
-/// Sums of squared differences of one row and the next.
-#[derive(Default, Clone, Copy)]
+/// Pairs that are summed side by side, each kind of sum in as many parts.
+const LANES: usize = 16;
+type Parts = [f64; LANES];
+
+/// Sums of squared grey differences of one row and the next.
+#[derive(Clone, Copy)]
 struct Sums {
-    raw: f64,
-    dolp: f64,
-    raw_lit: f64,
-    dolp_lit: f64,
-    lit_pairs: u64,
+    raw: Parts,
+    dolp: Parts,
+    raw_lit: Parts,
+    dolp_lit: Parts,
+}
+
+impl Sums {
+    const NONE: Self =
+        Self { raw: [0.0; LANES], dolp: [0.0; LANES], raw_lit: [0.0; LANES], dolp_lit: [0.0; LANES] };
+
+    /// Adds the pairs of equal index; `both_lit` is 1 for pairs of lit pixels and else 0.
+    #[inline(always)]
+    fn add(&mut self, one: &Greys, other: [&[f32]; 2], both_lit: &[f32]) {
+        let count = both_lit.len();
+        let [raw, dolp] = [&one.raw[..count], &one.dolp[..count]];
+        let [other_raw, other_dolp] = [&other[0][..count], &other[1][..count]];
+        let mut sums = *self;
+        for from in (0..count).step_by(LANES) {
+            let read = |values: &[f32]| {
+                let mut lanes = [0.0f32; LANES];
+                match values[from..].first_chunk::<LANES>() {
+                    Some(whole) => lanes = *whole,
+                    None => lanes.iter_mut().zip(&values[from..]).for_each(|(lane, value)| *lane = *value),
+                }
+                lanes
+            };
+            let (raw, dolp, lit) = (read(raw), read(dolp), read(both_lit));
+            let (other_raw, other_dolp) = (read(other_raw), read(other_dolp));
+            for l in 0..LANES {
+                let (of_raw, of_dolp) = (raw[l] - other_raw[l], dolp[l] - other_dolp[l]);
+                let (of_raw, of_dolp) = (of_raw * of_raw, of_dolp * of_dolp);
+                sums.raw[l] += f64::from(of_raw);
+                sums.dolp[l] += f64::from(of_dolp);
+                sums.raw_lit[l] += f64::from(of_raw * lit[l]);
+                sums.dolp_lit[l] += f64::from(of_dolp * lit[l]);
+            }
+        }
+        *self = sums;
+    }
+}
+
+/// Grey levels of a row: raw, and DOLP.
+struct Greys {
+    raw: Vec<f32>,
+    dolp: Vec<f32>,
+}
+
+/// What turns samples into grey levels.
+#[derive(Clone, Copy)]
+struct Scale {
+    per_dn: f32,
+    black_dn: f32,
+}
+
+impl Greys {
+    #[inline(always)]
+    fn fill<T: Sample>(&mut self, frame: &[T], dark_dn: &[f32], scale: Scale) {
+        let width = frame.len();
+        let (dark_dn, raw, dolp) = (&dark_dn[..width], &mut self.raw[..width], &mut self.dolp[..width]);
+        for x in 0..width {
+            let (dn, dark_dn) = (frame[x].dn() as f32, dark_dn[x]);
+            let sum = dn + dark_dn - 2.0 * scale.black_dn;
+            let degree = if sum > 0.0 { (dn - dark_dn) / sum } else { 0.0 };
+            raw[x] = dn * scale.per_dn;
+            dolp[x] = degree.clamp(0.0, 1.0) * 255.0;
+        }
+    }
+}
+
+/// Rows at hand on one thread.
+struct Scratch {
+    here: Greys,
+    below: Greys,
+    dark: [Vec<f32>; 2],
+    /// 1 where a pixel and its neighbour, to the right and below, are lit.
+    lit: [Vec<f32>; 2],
+}
+
+impl Scratch {
+    fn new(width: usize) -> Self {
+        let row = || vec![0.0; width];
+        let greys = || Greys { raw: row(), dolp: row() };
+        Self { here: greys(), below: greys(), dark: [row(), row()], lit: [row(), row()] }
+    }
+}
+
+/// The pairs of row `y` with their neighbours to the right and below, over all code frames.
+struct Row<'a, T> {
+    code: &'a [&'a [T]],
+    dark: &'a [&'a [T]],
+    lit: &'a Grid<bool>,
+    scale: Scale,
+    y: usize,
+    scratch: &'a mut Scratch,
+}
+
+impl<T: Sample> Work for Row<'_, T> {
+    type Output = Sums;
+
+    #[inline(always)]
+    fn run(self) -> Sums {
+        let Self { code, dark, lit, scale, y, scratch } = self;
+        let (width, has_below) = (lit.width(), y + 1 < lit.height());
+        let of_row = |y: usize| y * width..(y + 1) * width;
+        // The mean dark level of a row is the same for all frames.
+        for (y, mean) in (y..).zip(&mut scratch.dark).take(1 + usize::from(has_below)) {
+            mean.fill(0.0);
+            for plane in dark {
+                mean.iter_mut().zip(&plane[of_row(y)]).for_each(|(sum, sample)| *sum += sample.dn() as f32);
+            }
+            mean.iter_mut().for_each(|sum| *sum /= dark.len() as f32);
+        }
+        let both = |one: bool, other: bool| if one && other { 1.0 } else { 0.0 };
+        let [right, down] = &mut scratch.lit;
+        let lit_here = lit.row(y);
+        right.iter_mut().zip(lit_here.windows(2)).for_each(|(out, pair)| *out = both(pair[0], pair[1]));
+        if has_below {
+            let pairs = lit_here.iter().zip(lit.row(y + 1));
+            down.iter_mut().zip(pairs).for_each(|(out, (one, other))| *out = both(*one, *other));
+        }
+        let mut sums = Sums::NONE;
+        for frame in code {
+            scratch.here.fill(&frame[of_row(y)], &scratch.dark[0], scale);
+            let here = &scratch.here;
+            sums.add(here, [&here.raw[1..], &here.dolp[1..]], &scratch.lit[0][..width - 1]);
+            if has_below {
+                scratch.below.fill(&frame[of_row(y + 1)], &scratch.dark[1], scale);
+                sums.add(here, [&scratch.below.raw, &scratch.below.dolp], &scratch.lit[1]);
+            }
+        }
+        sums
+    }
+}
+
+/// Pairs of neighbouring pixels that are both lit.
+fn lit_pairs(lit: &Grid<bool>) -> u64 {
+    let count =
+        |pairs: &mut dyn Iterator<Item = (&bool, &bool)>| pairs.filter(|(a, b)| **a && **b).count() as u64;
+    let rows = 0..lit.height();
+    rows.map(|y| {
+        let here = lit.row(y);
+        let right = count(&mut here.iter().zip(&here[1..]));
+        let below = if y + 1 < lit.height() { count(&mut here.iter().zip(lit.row(y + 1))) } else { 0 };
+        right + below
+    })
+    .sum()
 }
 
 fn typed<T: Sample>(
@@ -66,87 +214,42 @@ fn typed<T: Sample>(
     }
     let code: Vec<&[T]> = code.iter().map(|&plane| T::of(plane)).collect::<Option<_>>()?;
     let dark: Vec<&[T]> = dark.iter().map(|&plane| T::of(plane)).collect::<Option<_>>()?;
-    let (width, height) = (lit.width(), lit.height());
-    let scale = 255.0 / ((1u32 << bit_depth) - 1) as f32;
-    let black = black_level_dn as f32;
-    // Grey levels of one row of one frame: raw, DOLP.
-    let grey_row = |frame: &[T], dark_dn: &[f32], y: usize, raw: &mut [f32], dolp: &mut [f32]| {
-        let frame = &frame[y * width..][..width];
-        let (dark_dn, raw, dolp) = (&dark_dn[..width], &mut raw[..width], &mut dolp[..width]);
-        for x in 0..width {
-            let (dn, dark_dn) = (frame[x].dn() as f32, dark_dn[x]);
-            let sum = dn + dark_dn - 2.0 * black;
-            let degree = if sum > 0.0 { (dn - dark_dn) / sum } else { 0.0 };
-            raw[x] = dn * scale;
-            dolp[x] = degree.clamp(0.0, 1.0) * 255.0;
-        }
-    };
-    // The mean dark level of a row, the same for all frames.
-    let dark_row = |y: usize, mean: &mut [f32]| {
-        for (x, mean) in mean.iter_mut().enumerate() {
-            let at = y * width + x;
-            *mean = dark.iter().map(|plane| plane[at].dn()).sum::<i32>() as f32 / dark.len() as f32;
-        }
-    };
-    let rows: Vec<Sums> = (0..height)
+    let scale = Scale { per_dn: 255.0 / ((1u32 << bit_depth) - 1) as f32, black_dn: black_level_dn as f32 };
+    let sums = sums_of(InstructionSet::widest(), &code, &dark, lit, scale);
+    let [raw, dolp, raw_lit, dolp_lit] = sums;
+    // Each unordered pair is two ordered ones of the four that every pixel has.
+    let pairs = 2.0 * (lit.len() * code.len()) as f64;
+    let lit_pairs = (lit_pairs(lit) * code.len() as u64) as f64;
+    Some(Contrast {
+        raw: raw / pairs,
+        dolp: dolp / pairs,
+        ratio: dolp / raw,
+        raw_lit: raw_lit / lit_pairs,
+        dolp_lit: dolp_lit / lit_pairs,
+        ratio_lit: dolp_lit / raw_lit,
+    })
+}
+
+/// Sums over all pairs: raw, DOLP, and both between lit pixels. Parts and rows are added in their order, on any number
+/// of threads.
+fn sums_of<T: Sample>(
+    set: InstructionSet,
+    code: &[&[T]],
+    dark: &[&[T]],
+    lit: &Grid<bool>,
+    scale: Scale,
+) -> [f64; 4] {
+    let rows: Vec<[f64; 4]> = (0..lit.height())
         .into_par_iter()
         .map_init(
-            || [0; 6].map(|_| vec![0.0f32; width]),
-            |[raw, dolp, raw_below, dolp_below, dark, dark_below], y| {
-                let mut sums = Sums::default();
-                let has_below = y + 1 < height;
-                dark_row(y, dark);
-                if has_below {
-                    dark_row(y + 1, dark_below);
-                }
-                for frame in &code {
-                    grey_row(frame, dark, y, raw, dolp);
-                    if has_below {
-                        grey_row(frame, dark_below, y + 1, raw_below, dolp_below);
-                    }
-                    let mut add = |one: (f32, f32), other: (f32, f32), both_lit: bool| {
-                        let raw = f64::from((one.0 - other.0) * (one.0 - other.0));
-                        let dolp = f64::from((one.1 - other.1) * (one.1 - other.1));
-                        sums.raw += raw;
-                        sums.dolp += dolp;
-                        if both_lit {
-                            sums.raw_lit += raw;
-                            sums.dolp_lit += dolp;
-                            sums.lit_pairs += 1;
-                        }
-                    };
-                    for x in 0..width {
-                        let here = (raw[x], dolp[x]);
-                        if x + 1 < width {
-                            add(here, (raw[x + 1], dolp[x + 1]), lit.at(x, y) && lit.at(x + 1, y));
-                        }
-                        if has_below {
-                            add(here, (raw_below[x], dolp_below[x]), lit.at(x, y) && lit.at(x, y + 1));
-                        }
-                    }
-                }
-                sums
+            || Scratch::new(lit.width()),
+            |scratch, y| {
+                let sums = set.run(Row { code, dark, lit, scale, y, scratch });
+                [sums.raw, sums.dolp, sums.raw_lit, sums.dolp_lit].map(|parts| parts.iter().sum())
             },
         )
         .collect();
-    let total = rows.iter().fold(Sums::default(), |a, b| Sums {
-        raw: a.raw + b.raw,
-        dolp: a.dolp + b.dolp,
-        raw_lit: a.raw_lit + b.raw_lit,
-        dolp_lit: a.dolp_lit + b.dolp_lit,
-        lit_pairs: a.lit_pairs + b.lit_pairs,
-    });
-    // Each unordered pair is two ordered ones of the four that every pixel has.
-    let pairs = 2.0 * (lit.len() * code.len()) as f64;
-    let lit_pairs = total.lit_pairs as f64;
-    Some(Contrast {
-        raw: total.raw / pairs,
-        dolp: total.dolp / pairs,
-        ratio: total.dolp / total.raw,
-        raw_lit: total.raw_lit / lit_pairs,
-        dolp_lit: total.dolp_lit / lit_pairs,
-        ratio_lit: total.dolp_lit / total.raw_lit,
-    })
+    rows.iter().fold([0.0; 4], |sums, row| std::array::from_fn(|kind| sums[kind] + row[kind]))
 }
 
 #[cfg(test)]
@@ -164,8 +267,8 @@ mod tests {
     }
 
     #[test]
-    fn agrees_to_the_bit_with_a_direct_sum_on_one_thread_and_on_two() {
-        let (width, height) = (13, 9);
+    fn agrees_with_a_direct_sum_and_to_the_bit_between_threads_and_instruction_sets() {
+        let (width, height) = (53, 9);
         let frame = |seed: u64| -> Vec<u16> {
             (0..width * height).map(|at| (random(seed << 32 | at as u64) & 0xfff) as u16).collect()
         };
@@ -204,17 +307,23 @@ mod tests {
         let pairs = 2.0 * (lit.len() * code.len()) as f64;
         let of_lit = f64::from(lit_pairs);
         let expected = [total[0] / pairs, total[1] / pairs, total[2] / of_lit, total[3] / of_lit];
-        let code: Vec<_> = code.iter().map(|plane| Plane::U16(plane)).collect();
-        let dark: Vec<_> = dark.iter().map(|plane| Plane::U16(plane)).collect();
-        for threads in [1, 2] {
+        let planes: Vec<Plane<'_>> = code.iter().map(|plane| Plane::U16(plane)).collect();
+        let darks: Vec<Plane<'_>> = dark.iter().map(|plane| Plane::U16(plane)).collect();
+        let found = [1, 2].map(|threads| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-            let found = pool.install(|| contrast(&code, &dark, 12, 41.5, &lit)).unwrap();
-            let found = [found.raw, found.dolp, found.raw_lit, found.dolp_lit];
-            assert_eq!(
-                found.map(f64::to_bits),
-                expected.map(f64::to_bits),
-                "{threads} threads: {found:?} {expected:?}"
-            );
+            let found = pool.install(|| contrast(&planes, &darks, 12, 41.5, &lit)).unwrap();
+            [found.raw, found.dolp, found.raw_lit, found.dolp_lit]
+        });
+        assert_eq!(found[0].map(f64::to_bits), found[1].map(f64::to_bits));
+        for (found, expected) in found[0].iter().zip(expected) {
+            assert!((found - expected).abs() <= 1e-12 * expected, "{found} {expected}");
+        }
+        let code: Vec<&[u16]> = code.iter().map(Vec::as_slice).collect();
+        let dark: Vec<&[u16]> = dark.iter().map(Vec::as_slice).collect();
+        let scale = Scale { per_dn: 255.0 / 4095.0, black_dn: 41.5 };
+        let sums = |set| sums_of(set, &code, &dark, &lit, scale).map(f64::to_bits);
+        for set in InstructionSet::available() {
+            assert_eq!(sums(set), sums(InstructionSet::Portable), "{set:?}");
         }
     }
 }
