@@ -1,13 +1,16 @@
 //! Joins the pure parts: frames and a calibration in, maps, cloud and report out. A scan and a decode of its bundle
 //! both come through here, which is why they agree bit for bit.
 
+mod ahead;
+
 use std::time::Instant;
 
 use polscan_patterns::Role;
 use thiserror::Error;
 
+pub use self::ahead::Ahead;
 use crate::{
-    cloud::{ReconstructError, ReconstructSettings, Reconstruction, reconstruct},
+    cloud::{ReconstructError, ReconstructSettings, Reconstruction, reconstruct, reconstruct_with},
     decode::{self, Accumulator, DecodeError, DecodeSettings, Decoded, SharedPlane},
     geometry::Calibration,
     grid::Grid,
@@ -27,6 +30,8 @@ pub struct Job<'a> {
     pub decode: DecodeSettings,
     /// Calibration of the rig.
     pub calibration: Option<&'a Calibration>,
+    /// What was prepared for it already.
+    pub ahead: Option<&'a Ahead>,
     /// Gates of the reconstruction.
     pub reconstruct: ReconstructSettings,
 }
@@ -66,7 +71,10 @@ pub fn run(job: &Job) -> Result<Outcome, PipelineError> {
     let start_triangulate = Instant::now();
     let reconstruction = match job.calibration {
         Some(calibration) if calibration.projector.is_some() => {
-            Some(reconstruct(&decoded, calibration, &job.reconstruct)?)
+            Some(match job.ahead.and_then(|ahead| ahead.triangulator(Some(calibration))) {
+                Some(triangulator) => reconstruct_with(triangulator, &decoded, &job.reconstruct)?,
+                None => reconstruct(&decoded, calibration, &job.reconstruct)?,
+            })
         }
         _ => None,
     };

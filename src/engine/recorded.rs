@@ -83,6 +83,7 @@ impl Recorded {
             planes: &self.frames.planes,
             decode: self.bundle.manifest().decode_settings(&self.sequence, size, self.frames.sample_bits),
             calibration: self.calibration.as_ref(),
+            ahead: None,
             reconstruct: ReconstructSettings {
                 near_mm: volume.near_mm,
                 far_mm: volume.far_mm,

@@ -14,7 +14,7 @@ use crate::{
     config::Settings,
     decode::{Accumulator, DecodeSettings, SharedPlane},
     geometry::Calibration,
-    pipeline::{self, Context, Job, PipelineError},
+    pipeline::{self, Ahead, Context, Job, PipelineError},
     report::{
         self, CaptureSummary, Diagnosis, NamedRegion, Reason, Report, ReportInput, Size, check_regions,
     },
@@ -39,6 +39,7 @@ pub struct Scan {
     plan: Plan,
     decode: DecodeSettings,
     calibration: Option<Calibration>,
+    ahead: Ahead,
     reconstruct: ReconstructSettings,
     regions: Vec<NamedRegion>,
     rig: manifest::Rig,
@@ -169,6 +170,7 @@ impl Scan {
             plan,
             decode,
             calibration,
+            ahead: Ahead::default(),
             reconstruct: ReconstructSettings {
                 near_mm: settings.raw.volume.near_mm,
                 far_mm: settings.raw.volume.far_mm,
@@ -228,6 +230,7 @@ impl Scan {
         progress: &mut dyn FnMut(Progress<'_>),
         cancel: &CancelFlag,
     ) -> Taken {
+        self.ahead.begin(self.calibration.as_ref());
         let DecodeSettings { camera, thresholds, .. } = self.decode;
         let mut judge = PairSumJudge::new(self.plan.sequence.clone(), camera, thresholds);
         let Rig { projector, camera, clock, .. } = rig;
@@ -294,6 +297,7 @@ impl Scan {
             planes: &frames.planes,
             decode: self.decode.clone(),
             calibration: self.calibration.as_ref(),
+            ahead: Some(&self.ahead),
             reconstruct: self.reconstruct,
         }
     }
