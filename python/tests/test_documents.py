@@ -48,7 +48,7 @@ def test_every_block_of_the_cookbook_runs(
         else:
             assert language == "console", f"line {line}: who runs {language}?"
         run.append(language)
-    assert (run.count("python"), run.count("sh")) == (16, 1)
+    assert (run.count("python"), run.count("sh")) == (17, 1)
     told = capsys.readouterr().out
     assert "nothing-lit" in told
     assert "mm" in told

@@ -54,6 +54,8 @@ from .models import (
     Readiness,
     ScanInfo,
     Series,
+    SessionState,
+    SessionView,
     Status,
 )
 from .report import Plane, Report
@@ -105,6 +107,8 @@ __all__ = [
     "ScanInfo",
     "Scanner",
     "Series",
+    "SessionState",
+    "SessionView",
     "Status",
     "Unauthorized",
     "WaitTimeout",

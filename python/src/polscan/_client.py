@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import ssl
 import tempfile
-from collections.abc import Generator, Iterable
+from collections.abc import Generator, Iterable, Mapping
 from datetime import datetime
 from pathlib import Path
 from types import TracebackType
@@ -20,7 +20,18 @@ from ._requests import KEEP, Deadline, Keep, Patience
 from ._sse import EventParser, PartParser
 from .bundle import Bundle, Maps, open_bundle, read_cloud
 from .errors import CalibrationFailed, ConnectionLost, NotFound, Problem, ProtocolError, ScanFailed, problem
-from .models import CalibrationInfo, Calibrations, Devices, Event, Page, Preview, Readiness, ScanInfo, Status
+from .models import (
+    CalibrationInfo,
+    Calibrations,
+    Devices,
+    Event,
+    Page,
+    Preview,
+    Readiness,
+    ScanInfo,
+    SessionView,
+    Status,
+)
 from .report import Report
 
 _JSON = {"Content-Type": "application/json"}
@@ -326,6 +337,29 @@ class Scanner:
         given = {"angle_deg": angle_deg, "card": card, "coupon": coupon, "watch_s": watch_s}
         body: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
         return self._calibrate("polarization", {**body, "with": _requests.tag_list(with_)})
+
+    def calibrate_rig(
+        self,
+        board: Mapping[str, Any] | str | Path,
+        *,
+        measured_mm: float | None = None,
+        baseline_mm: float | None = None,
+        gates: Mapping[str, Any] | None = None,
+    ) -> Calibration:
+        """Opens a session that calibrates camera and projector with a board: `take_view()` for each place of it, then `solve()`.
+
+        `board` is the description that `polscan calibrate board` writes beside the page, or the path of it; `measured_mm` the
+        length of the page's bar by a ruler, `baseline_mm` the distance of camera and projector by a ruler; `gates` are limits
+        other than the usual ones. One session is open at a time.
+        """
+        described = _requests.board(board)
+        given = {
+            "measured_mm": measured_mm,
+            "baseline_mm": baseline_mm,
+            "gates": dict(gates) if gates else None,
+        }
+        body = {name: value for name, value in given.items() if value is not None}
+        return self._calibrate("rig", {"board": described, **body})
 
     def _calibrate(self, kind: str, body: dict[str, Any]) -> Calibration:
         # There are no keys for calibrations: one whose answer is lost is not asked for twice.
@@ -644,6 +678,42 @@ class Calibration:
         if check and self.info.state != "done":
             raise CalibrationFailed(self.info)
         return self.info
+
+    def settled(self, timeout_s: float | None = None) -> CalibrationInfo:
+        """Waits until a step that is under way is over: until it is `open` again, or at its end."""
+        deadline = Deadline(timeout_s, f"the step of calibration {self.id}")
+        while (self.refresh()).state == "running":
+            _pause.sleep(deadline.left(0.1))
+        return self.info
+
+    def _step(self, method: str, path: str, timeout_s: float | None) -> CalibrationInfo:
+        # A view that is asked for twice were two views.
+        self.scanner._send(method, f"{self.href}/{path}", again=False)
+        return self.settled(timeout_s)
+
+    def take_view(self, timeout_s: float | None = None) -> SessionView:
+        """Takes a view of the board as it stands. `CalibrationFailed` says why there is none; the session stays open.
+
+        `info.session.missing` says what the next one should do. A view may still be of no use: `unusable` says why.
+        """
+        info = self._step("POST", "views", timeout_s)
+        if info.error is not None or info.session is None or not info.session.views:
+            raise CalibrationFailed(info)
+        return info.session.views[-1]
+
+    def drop_view(self, name: str, timeout_s: float | None = None) -> CalibrationInfo:
+        """Drops a view with its frames."""
+        return self._step("DELETE", f"views/{_requests.segment(name)}", timeout_s)
+
+    def solve(self, timeout_s: float | None = None, *, check: bool = True) -> CalibrationInfo:
+        """Calibrates from the views. `CalibrationFailed` where it is refused, unless `check` is false; the session stays open.
+
+        `refused` has the failing checks and the view to drop.
+        """
+        info = self._step("POST", "solve", timeout_s)
+        if check and not info.accepted:
+            raise CalibrationFailed(info)
+        return info
 
     def cancel(self) -> CalibrationInfo:
         """Stops it; a watch ends as `done`."""

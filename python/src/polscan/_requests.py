@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import json
 import math
 import os
 import re
 import time
+import tomllib
 import uuid
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
 from typing import IO, Any, Final
+from urllib.parse import quote
 
 import httpx
 
@@ -92,6 +95,19 @@ def scan_body(
     given = {"mode": mode, "exposure_us": exposure_us, "label": label, "repeat": repeat}
     body: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     return {**body, "tags": tag_list(tags), "queue": queue}
+
+
+def board(description: Mapping[str, Any] | str | Path) -> dict[str, Any]:
+    """The description of a board, from its file where it is a path."""
+    if not isinstance(description, str | Path):
+        return dict(description)
+    text = Path(description).read_text(encoding="utf-8")
+    return dict(json.loads(text) if Path(description).suffix == ".json" else tomllib.loads(text))
+
+
+def segment(name: str) -> str:
+    """A name as a part of an address."""
+    return quote(name, safe="")
 
 
 def tag_list(tags: Iterable[str]) -> list[str]:

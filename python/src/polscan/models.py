@@ -240,6 +240,41 @@ class LiveValue(Document):
 
 
 @dataclass(frozen=True, kw_only=True)
+class SessionView(Document):
+    """A view of the board in a session."""
+
+    name: str
+    corners: int
+    """Corners of the board that were found."""
+    plane_points: int
+    """Decoded points on the board."""
+    corner_sigma_px: float | None = None
+    """Their standard deviation by the picture's noise, rms."""
+    tilt_deg: tuple[float, ...] | None = None
+    """Tilt of the board about the image's x and y axis, by a lens that is guessed from the views."""
+    unusable: str | None = None
+    """Why it is of no use; nothing where it is."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SessionState(Document):
+    """A session with a board as it stands."""
+
+    board: str
+    """The board, in words."""
+    views: tuple[SessionView, ...]
+    """In the order in which they were taken."""
+    missing: tuple[str, ...]
+    """What the next views should do: parts of the image, tilts. Empty when nothing is missing."""
+    views_missing: int
+    """Views still missing at least."""
+    camera_coverage: tuple[tuple[int, ...], ...]
+    """Corners of the board in each ninth of the camera's image, rows from the top."""
+    projector_coverage: tuple[tuple[int, ...], ...]
+    """Decoded points of the board in each ninth of the projector's picture, rows from the top."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class CalibrationInfo(Document):
     """All that is known of a calibration at one moment."""
 
@@ -255,7 +290,7 @@ class CalibrationInfo(Document):
     doing: str | None = None
     angle_deg: float | None = None
     live: LiveValue | None = None
-    session: dict[str, Any] | None = None
+    session: SessionState | None = None
     """What is still missing and which views there are, of a session with a board."""
     accepted: bool | None = None
     """Whether it can be trusted; nothing before its end."""
