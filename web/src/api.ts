@@ -66,6 +66,26 @@ export interface Device {
   in_use: boolean;
 }
 
+/** A view of the board in a session. */
+export interface SessionView {
+  name: string;
+  corners: number;
+  plane_points: number;
+  corner_sigma_px: number | null;
+  tilt_deg: number[] | null;
+  unusable: string | null;
+}
+
+/** A session with a board as it stands. */
+export interface Session {
+  board: string;
+  views: SessionView[];
+  missing: string[];
+  views_missing: number;
+  camera_coverage: number[][];
+  projector_coverage: number[][];
+}
+
 export interface Run {
   id: string;
   revision: number;
@@ -79,6 +99,7 @@ export interface Run {
   refused: string[];
   summary: string[];
   error: Cause | null;
+  session: Session | null;
   live: { h_dn: number; v_dn: number; off_deg: number | null; advice: string; values: number } | null;
   href: string;
   artifacts: { name: string; href: string }[];

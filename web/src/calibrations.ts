@@ -3,6 +3,7 @@
 import { get, local, post, type Run } from "./api";
 import { badge, field, guarded, h, moment, say } from "./dom";
 import { current, listen } from "./events";
+import { sessionForm, sessionPanel } from "./session";
 import { calibrationOutcome, sentences } from "./words";
 
 interface Answer {
@@ -24,8 +25,10 @@ function liveValue(run: Run): HTMLElement | null {
   );
 }
 
-function entry(run: Run): HTMLElement {
+function entry(run: Run, refresh: () => Promise<void>): HTMLElement {
   const [tone, word] = calibrationOutcome(run);
+  const going = run.state === "open" || run.state === "running";
+  const session = run.session ? sessionPanel(run, run.session, refresh) : null;
   const files = run.artifacts.map((artifact) =>
     h("button", { type: "button", class: "link", onclick: guarded(async () => {
       const link = h("a", { href: await local(artifact.href), download: artifact.name });
@@ -37,11 +40,14 @@ function entry(run: Run): HTMLElement {
     "article",
     { class: "panel", "data-run": run.id },
     h("div", { class: "row spread" }, h("h2", {}, `${run.kind}${run.watch ? ", watching" : ""}`), badge(tone, word), h("span", { class: "small" }, moment(run.created))),
-    run.state === "running" ? h("p", { role: "status" }, sentences(run.doing ?? "begins")) : null,
+    run.state === "running" && !run.session ? h("p", { role: "status" }, sentences(run.doing ?? "begins")) : null,
     liveValue(run),
     run.error ? h("p", { class: "cause" }, sentences(run.error.message)) : null,
     ...run.refused.map((reason) => h("p", { class: "cause" }, sentences(reason))),
-    run.summary.length ? h("ul", {}, ...run.summary.map((line) => h("li", {}, sentences(line)))) : null,
+    going ? session : null,
+    // While a session goes on its own words say what is missing.
+    run.summary.length && !(going && session) ? h("ul", {}, ...run.summary.map((line) => h("li", {}, sentences(line)))) : null,
+    going ? null : session,
     files.length ? h("p", { class: "row" }, ...files) : null,
     run.state === "running"
       ? h("button", { type: "button", onclick: guarded(() => post(`${run.href}/cancel`)) }, run.watch ? "Enough" : "Cancel")
@@ -66,9 +72,14 @@ export function calibrations(main: HTMLElement): () => void {
   function draw(): void {
     const focused = document.activeElement?.closest("[data-run]")?.getAttribute("data-run");
     const newest = [...runs.values()].sort((one, other) => (one.id < other.id ? 1 : -1));
-    list.replaceChildren(...newest.map(entry));
+    list.replaceChildren(...newest.map((run) => entry(run, () => refresh(run))));
     if (runs.size === 0) list.append(h("p", { class: "none" }, "Nothing was calibrated by this service yet."));
     if (focused) list.querySelector<HTMLElement>(`[data-run="${focused}"] button`)?.focus();
+  }
+  async function refresh(run: Run): Promise<void> {
+    const found = (await get<Answer>("/v1/calibrations")).runs.find((one) => one.id === run.id);
+    if (found) take(await current<Run>(found.href));
+    else await load();
   }
   function take(run: Run): void {
     runs.set(run.id, run);
@@ -108,6 +119,7 @@ export function calibrations(main: HTMLElement): () => void {
         h("button", { type: "button", class: "primary", onclick: () => begin("polarization", measured())() }, "Polarization"),
         field("Polarizer reads (°)", angle),
       ),
+      sessionForm((body) => begin("rig", body)),
     ),
     list,
   );

@@ -81,6 +81,7 @@ export function coverage(report: Report): number | null {
 
 /** Where a calibration is. */
 export function calibrationOutcome(run: Run): [Tone, string] {
+  if (run.state === "open" && run.accepted === false) return ["bad", "✗ refused, open"];
   if (run.state === "running" || run.state === "open") return ["busy", run.state];
   if (run.state !== "done") return [run.state === "failed" ? "bad" : "plain", run.state];
   if (run.accepted === false) return ["bad", "✗ refused"];
