@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import pickle
 import ssl
+import subprocess
 import threading
 import time
 from pathlib import Path
@@ -35,6 +36,53 @@ def test_a_failed_scan_says_why_and_keeps_its_files(scanner: Scanner, tmp_path: 
     assert scan.frames().shape[0] == report.frames
     assert len(polscan.read_cloud(scan.fetch("cloud.ply", tmp_path))) == 0
     assert str(pickle.loads(pickle.dumps(failed.value))) == str(failed.value)  # noqa: S301 - just made
+
+
+BUMPED = """
+[[sim.faults]]
+kind = "bumped-object"
+at_ms = 1500.0
+object = "black"
+by_mm = [4.0, 0.0, 0.0]
+"""
+
+
+@pytest.mark.parametrize(
+    ("fault", "exposure_us", "diagnosis", "decoded"),
+    [(BUMPED, None, "motion", False), ("", 1.0, "nothing-lit", True)],
+    ids=["while-it-is-captured", "when-it-is-decoded"],
+)
+def test_a_script_and_curl_are_told_the_same_of_a_failed_scan(
+    make_service: MakeService, fault: str, exposure_us: float | None, diagnosis: str, decoded: bool
+) -> None:
+    service = make_service()
+    service.config.write_text(service.config.read_text() + fault)
+    service.start()
+    with Scanner(service.url) as scanner:
+        scanner.wait_ready(30)
+        scan = scanner.scan(exposure_us=exposure_us)
+        with pytest.raises(polscan.ScanFailed) as failed:
+            scan.cloud()
+        picture = scan.evidence()
+
+    def curl(path: str) -> bytes:
+        command = ["curl", "-sS", "--fail", f"{service.url}/v1/scans/{scan.id}{path}"]
+        return subprocess.run(command, check=True, capture_output=True).stdout
+
+    told = json.loads(curl(""))
+    assert told["reasons"][0]["type"] == diagnosis
+    assert [reason.raw for reason in failed.value.reasons] == told["reasons"]
+    report = json.loads(curl("/report.json"))
+    assert [reason["message"] for reason in report["reasons"]] == [one["message"] for one in told["reasons"]]
+    assert report["reasons"][0]["evidence"]
+    # What a person reads has the same words, in lines.
+    words = " ".join(curl("/summary.txt").decode().split())
+    assert " ".join(told["reasons"][0]["message"].split()) in words
+    assert (picture is not None) == decoded
+    if picture is not None:
+        names = [one["name"] for one in told["artifacts"]]
+        name = "maps/worst-pair.png" if "maps/worst-pair.png" in names else "maps/residual.png"
+        assert picture == curl(f"/{name}")
 
 
 def test_a_busy_rig_names_who_has_it(bench: Scanner) -> None:

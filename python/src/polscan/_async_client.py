@@ -572,6 +572,15 @@ class AsyncScan:
         with tempfile.TemporaryDirectory(prefix="polscan-") as folder:
             return (await self.fetch(name, Path(folder) / "file")).read_bytes()
 
+    async def evidence(self) -> bytes | None:
+        """Waits for the scan and returns the picture of what does not add up at each pixel, in units of the camera's noise, as a PNG.
+
+        Yellow is where to look. Of a scan that nothing was decoded of there is none.
+        """
+        await self.done(check=False)
+        pictures = [name for name in ("maps/worst-pair.png", "maps/residual.png") if self.info.artifact(name)]
+        return await self.read(pictures[0]) if pictures else None
+
     async def download(self, folder: str | Path) -> Bundle:
         """Fetches all files into a folder, and opens it. What lies there already with the right hash is not fetched again."""
         await self.done(check=False)
