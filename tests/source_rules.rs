@@ -11,7 +11,7 @@ use std::{
 
 /// Modules of the crate `reconstruction` that compute and do nothing else, in the order in which data flows: each may use itself and
 /// those before it.
-const PURE: [&str; 4] = ["grid", "decode", "geometry", "cloud"];
+const PURE: [&str; 5] = ["grid", "simd", "decode", "geometry", "cloud"];
 
 /// What code that only computes has no business with.
 const IMPURE: [&str; 9] = [

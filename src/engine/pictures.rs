@@ -5,7 +5,7 @@ use rayon::prelude::*;
 
 use super::results::Results;
 use crate::{
-    decode::Plane,
+    decode::{DecodeSettings, Plane, SharedPlane},
     evidence,
     grid::Grid,
     report::pictures::{
@@ -43,6 +43,21 @@ pub fn write(writer: &BundleWriter, results: &Results, maps: &Maps) -> Result<()
         pictures.push(("maps/worst-pair.png", Box::new(move || residual_picture(&residual))));
     }
     pictures.par_iter().try_for_each(|(name, draw)| writer.png(name, &draw()))
+}
+
+/// Draws and writes where in the image a fault lies, of frames that were not decoded.
+pub fn write_unfinished(
+    writer: &BundleWriter,
+    roles: &[Role],
+    frames: &[SharedPlane],
+    settings: &DecodeSettings,
+) -> Result<(), StorageError> {
+    let planes: Vec<(Role, Plane<'_>)> =
+        roles.iter().copied().zip(frames.iter().map(|frame| frame.plane())).collect();
+    match evidence::worst_residual(&planes, settings) {
+        Some(residual) => writer.png("maps/worst-pair.png", &residual_picture(&residual)),
+        None => Ok(()),
+    }
 }
 
 /// Residual of the pair that adds up least, where any is conspicuous: where in the image a fault lies.

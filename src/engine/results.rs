@@ -65,6 +65,7 @@ pub fn write_unfinished(
     let start = Instant::now();
     let failed = |error: StorageError| Failure::storage("write what was captured", error);
     write_frames(&writer, decode, frames).map_err(failed)?;
+    pictures::write_unfinished(&writer, &manifest.sequence, frames, decode).map_err(failed)?;
     write_calibration(&writer, &mut manifest, calibration).map_err(failed)?;
     manifest.record_decode(decode);
     manifest.stamp(std::time::SystemTime::now());

@@ -224,12 +224,7 @@ impl<'a> Frames<'a> {
     pub fn residual_map(&self, axis: Axis, bit: u8) -> Option<Grid<f32>> {
         let frame = |inverse| self.of(Role::Code { axis, bit, inverse }).first().copied();
         let pair = [frame(false)?, frame(true)?];
-        let sampler = self.sampler(pair, Expected::References(self.references()?), false);
-        let residuals = (0..sampler.width * sampler.height).map(|at| {
-            let pixel = sampler.pixel(at % sampler.width, at / sampler.width);
-            pixel.map_or(f32::NAN, |pixel| (pixel.residual / pixel.sigma).abs() as f32)
-        });
-        Some(Grid::from_vec(sampler.width, sampler.height, residuals.collect()))
+        Some(self.sampler(pair, Expected::References(self.references()?), false).residual_map())
     }
 
     /// Looks at two frames as if they were the pair, by the first references alone. `None` without them.
@@ -361,12 +356,21 @@ pub struct Pair<'a> {
 impl Pair<'_> {
     /// Looks at it. `None` where too little light is seen, or frames differ in size.
     pub fn look(&self, flat_only: bool) -> Option<Look> {
+        self.sampler(flat_only)?.look()
+    }
+
+    /// Residual in units of its noise, positive, at every pixel; NaN where it says nothing. `None` where frames differ in size.
+    pub fn residual_map(&self) -> Option<Grid<f32>> {
+        Some(self.sampler(false)?.residual_map())
+    }
+
+    fn sampler(&self, flat_only: bool) -> Option<Sampler<'_>> {
         let len = self.frames[0].len();
         let same = self.frames.iter().chain(&self.references).all(|plane| plane.len() == len);
         if !same || self.width == 0 || !len.is_multiple_of(self.width) {
             return None;
         }
-        Sampler {
+        Some(Sampler {
             pair: self.frames,
             expected: Expected::References(self.references.map(|plane| vec![plane])),
             flat_only,
@@ -377,8 +381,7 @@ impl Pair<'_> {
             noise: self.noise,
             class: None,
             modulation: None,
-        }
-        .look()
+        })
     }
 }
 
@@ -398,6 +401,14 @@ struct Sampler<'a> {
 }
 
 impl Sampler<'_> {
+    fn residual_map(&self) -> Grid<f32> {
+        let residuals = (0..self.width * self.height).map(|at| {
+            let pixel = self.pixel(at % self.width, at / self.width);
+            pixel.map_or(f32::NAN, |pixel| (pixel.residual / pixel.sigma).abs() as f32)
+        });
+        Grid::from_vec(self.width, self.height, residuals.collect())
+    }
+
     fn look(&self) -> Option<Look> {
         let stride = ((self.width * self.height) as f64 / PIXELS as f64).sqrt().ceil().max(1.0) as usize;
         let rows: Vec<usize> = (0..self.height).step_by(stride).collect();

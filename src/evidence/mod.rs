@@ -4,6 +4,7 @@
 pub mod exposure;
 mod look;
 pub mod settling;
+mod unfinished;
 
 use crate::{
     decode::{NoiseModel, PairResidual, Plane},
@@ -11,6 +12,7 @@ use crate::{
 };
 
 pub use look::{Frames, Look, Pair, sample};
+pub use unfinished::worst_residual;
 
 /// Share of flat pixels beyond 5 sigma that disturbs a pair. Real captures that are sound stay below 0.0002, and noise
 /// alone below 0.000001; 0.002 of 1 MP is an area of 45 x 45 px.

@@ -17,7 +17,11 @@ test.describe("an object that is moved during the scan", () => {
     // Word for word what a script is told; the message ends with what to do.
     await expect(causes.first().locator("p")).toContainText(scan.reasons[0].message.slice(1));
     await expect(causes.first()).toContainText("The numbers behind it");
+    // Nothing was decoded, but the frames show where it happened.
+    const evidence = page.getByRole("img", { name: "Residual at each pixel" });
+    await expect.poll(() => evidence.evaluate((image: HTMLImageElement) => image.naturalWidth)).toBeGreaterThanOrEqual(400);
     await accessible(page);
+    await shot(page, "failed", true);
   });
 });
 
