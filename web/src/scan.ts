@@ -120,17 +120,19 @@ export function scanView(main: HTMLElement, id: string): () => void {
     const report = has("report.json") ? await get<Report>(`${scan.href}/report.json`) : null;
     const words = await reportPanel(scan, report);
     if (ended) return;
-    const side = h("div", { class: "column" }, words, editPanel(scan), filesPanel(scan));
+    const [cloud, maps] = [has("cloud.ply"), has("maps.npz")];
+    const side = h("div", { class: "column" }, editPanel(scan), filesPanel(scan));
     const wide = h("div", { class: "column" });
+    // Without a result to look at, the report is what there is to see.
+    if ((cloud && scan.points) || maps) side.prepend(words);
+    else wide.append(words);
     body.replaceChildren(wide, side);
-    const cloud = has("cloud.ply");
     if (cloud && scan.points) {
       const [panel, end] = cloudPanel(cloud.href);
       wide.append(panel);
       dispose = end;
     }
     if (ended) dispose();
-    const maps = has("maps.npz");
     if (maps) {
       const holder = h("section", { class: "panel", "aria-labelledby": "maps-title" }, h("h2", { id: "maps-title" }, "Maps"));
       wide.append(holder);
