@@ -101,13 +101,13 @@ pub async fn post_view(
 ///
 /// The calibration is `running` until it is solved: then `done` and `accepted`, with `calibration.toml` among its
 /// `artifacts`, or `open` again, with the failing checks and the view to drop in `refused`. More views can be taken
-/// and it be solved again.
+/// and it be solved again. It needs no rig: scans go on meanwhile.
 #[utoipa::path(post, path = "/v1/calibrations/{id}/solve", tag = "calibrations", params(("id" = String, Path)),
     responses((status = 202, description = "Begun", body = CalibrationRun,
             headers(("Location" = String, description = "Address of the calibration"))),
         (status = 404, description = "Unknown", body = ProblemBody, content_type = "application/problem+json"),
-        (status = 409, description = "Something else has the rig, or it is no open session", body = ProblemBody, content_type = "application/problem+json"),
-        (status = 503, description = "The rig is not open", body = ProblemBody, content_type = "application/problem+json")))]
+        (status = 409, description = "A step is under way, or it is no open session", body = ProblemBody, content_type = "application/problem+json"),
+        (status = 503, description = "The service is ending, or the disk says no", body = ProblemBody, content_type = "application/problem+json")))]
 pub async fn post_solve(
     Shared(app): Shared<App>,
     id: OnePart,
@@ -118,14 +118,14 @@ pub async fn post_solve(
 
 /// Drop a view
 ///
-/// With its frames.
+/// With its frames. It needs no rig.
 #[utoipa::path(delete, path = "/v1/calibrations/{id}/views/{name}", tag = "calibrations",
     params(("id" = String, Path), ("name" = String, Path, description = "Name of the view, as `session.views` has it")),
     responses((status = 202, description = "Begun", body = CalibrationRun,
             headers(("Location" = String, description = "Address of the calibration"))),
         (status = 404, description = "Unknown calibration or view", body = ProblemBody, content_type = "application/problem+json"),
-        (status = 409, description = "Something else has the rig, or it is no open session", body = ProblemBody, content_type = "application/problem+json"),
-        (status = 503, description = "The rig is not open", body = ProblemBody, content_type = "application/problem+json")))]
+        (status = 409, description = "A step is under way, or it is no open session", body = ProblemBody, content_type = "application/problem+json"),
+        (status = 503, description = "The service is ending, or the disk says no", body = ProblemBody, content_type = "application/problem+json")))]
 pub async fn delete_view(
     Shared(app): Shared<App>,
     parts: Result<Part<(String, String)>, PathRejection>,

@@ -11,11 +11,13 @@ use polscan_patterns::Mode;
 
 use super::{
     owner::Message,
-    rig::{Captured, said},
+    rig::{Captured, calibrate::Said, said},
 };
 use crate::{
+    calibrate,
     engine::{self, DecodeRequest, Failure, Label},
     report::Report,
+    sequencer::CancelFlag,
 };
 
 /// How much the computing threads stand back behind all others.
@@ -37,6 +39,21 @@ pub enum Work {
         /// Where the result goes.
         bundle: PathBuf,
     },
+    /// A step of a calibration that needs no rig.
+    Step(Box<Step>),
+}
+
+/// A step of a session with a board.
+#[derive(Debug)]
+pub struct Step {
+    /// Identity of the calibration.
+    pub id: String,
+    /// What to do.
+    pub task: calibrate::rig::Task,
+    /// Asks it to stop.
+    pub cancel: CancelFlag,
+    /// Where its files will be.
+    pub folder: PathBuf,
 }
 
 /// What the thread tells.
@@ -53,6 +70,13 @@ pub enum News {
         id: String,
         /// What came of it.
         result: Result<Box<Report>, Broken>,
+    },
+    /// What a step of a calibration tells.
+    Calibration {
+        /// Calibration.
+        id: String,
+        /// What it says.
+        said: Said,
     },
 }
 
@@ -88,41 +112,59 @@ pub fn pool() -> Result<rayon::ThreadPool, rayon::ThreadPoolBuildError> {
 pub fn run(pool: &rayon::ThreadPool, news: &Sender<Message>, work: &Receiver<Work>) {
     let tell = |said| drop(news.send(Message::Finish(said)));
     for work in work {
-        let id = match &work {
-            Work::Capture(captured) => captured.label.id.clone(),
-            Work::Recorded { label, .. } => label.id.clone(),
-        };
-        tell(News::Begun { id: id.clone() });
-        let span = tracing::info_span!("scan", id);
-        let _inside = span.enter();
-        let done = catch_unwind(AssertUnwindSafe(|| pool.install(|| span.in_scope(|| finish(work)))));
-        let result = match done {
-            Ok(result) => result.map(Box::new).map_err(Broken::from),
-            Err(panic) => {
-                let message = format!("a defect of this program: {}", said(&*panic));
-                Err(Broken { kind: "internal", message })
+        match work {
+            Work::Capture(captured) => {
+                let Captured { scan, taken, writer, label } = *captured;
+                let id = label.id.clone();
+                finish(pool, &tell, id, || scan.finish(&taken, label, writer));
             }
-        };
-        tell(News::Finished { id, result });
+            Work::Recorded { label, source, mode, bundle } => {
+                let recorded = DecodeRequest {
+                    bundle: &source,
+                    calibration: None,
+                    projector_left: false,
+                    calibration_unit_mm: 1.0,
+                    mode,
+                    regions: &[],
+                };
+                let id = label.id.clone();
+                finish(pool, &tell, id, || engine::decode(&recorded, label, &bundle));
+            }
+            Work::Step(step) => take_step(pool, &tell, &step),
+        }
     }
 }
 
-fn finish(work: Work) -> Result<Report, Failure> {
-    match work {
-        Work::Capture(captured) => {
-            let Captured { scan, taken, writer, label } = *captured;
-            scan.finish(&taken, label, writer)
-        }
-        Work::Recorded { label, source, mode, bundle } => {
-            let recorded = DecodeRequest {
-                bundle: &source,
-                calibration: None,
-                projector_left: false,
-                calibration_unit_mm: 1.0,
-                mode,
-                regions: &[],
-            };
-            engine::decode(&recorded, label, &bundle)
+fn finish(
+    pool: &rayon::ThreadPool,
+    tell: &(dyn Fn(News) + Sync),
+    id: String,
+    work: impl FnOnce() -> Result<Report, Failure> + Send,
+) {
+    tell(News::Begun { id: id.clone() });
+    let span = tracing::info_span!("scan", id);
+    let result = outcome(catch_unwind(AssertUnwindSafe(|| pool.install(|| span.in_scope(work)))));
+    tell(News::Finished { id, result });
+}
+
+/// What came of work that may have been broken off by a defect.
+fn outcome<T>(done: std::thread::Result<Result<T, Failure>>) -> Result<Box<T>, Broken> {
+    match done {
+        Ok(result) => result.map(Box::new).map_err(Broken::from),
+        Err(panic) => {
+            let message = format!("a defect of this program: {}", said(&*panic));
+            Err(Broken { kind: "internal", message })
         }
     }
+}
+
+fn take_step(pool: &rayon::ThreadPool, tell: &(dyn Fn(News) + Sync), step: &Step) {
+    let tell = |said| tell(News::Calibration { id: step.id.clone(), said });
+    let span = tracing::info_span!("calibration", id = step.id);
+    let work = || {
+        let mut doing = |what: &str| tell(Said::Doing(what.to_owned()));
+        calibrate::rig::compute(&step.task, &step.folder, &step.cancel, &mut doing)
+    };
+    let end = outcome(catch_unwind(AssertUnwindSafe(|| pool.install(|| span.in_scope(work)))));
+    tell(Said::Ended(end));
 }

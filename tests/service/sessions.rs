@@ -226,3 +226,81 @@ fn a_death_in_the_middle_of_a_view_costs_that_view_alone() {
         .collect();
     assert!(left.is_empty(), "{left:?}");
 }
+
+#[test]
+fn solving_and_dropping_need_no_rig() {
+    let daemon = Daemon::real_time();
+    daemon.ready();
+    let id = open(&daemon);
+    view(&daemon, &id);
+    view(&daemon, &id);
+    let scan = daemon.scan(&json!({}));
+    let is_captured = || daemon.get(&format!("/v1/scans/{scan}")).expect(200).json()["state"] == "projecting";
+    while !is_captured() {
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    // A view has to wait for its turn; what only computes has not.
+    assert_eq!(begin(&daemon, &id, "views").expect(409).json()["holder"]["id"], json!(scan));
+    drop_view(&daemon, &id, "view-01").expect(202);
+    assert_eq!(names(&settled(&daemon, &id)), ["view-02"]);
+    let refused = step(&daemon, &id, "solve");
+    assert_eq!((&refused["state"], &refused["accepted"]), (&json!("open"), &json!(false)), "{refused}");
+    assert!(is_captured(), "the scan went on meanwhile");
+    let done = daemon.get(&format!("/v1/scans/{scan}?wait=done")).expect(200).json();
+    assert_eq!((&done["state"], &done["verdict"]), (&json!("done"), &json!("ok")), "{done}");
+    assert_eq!(names(&view(&daemon, &id)), ["view-02", "view-03"]);
+}
+
+#[test]
+fn a_solve_that_is_cut_short_leaves_all_or_nothing() {
+    let mut daemon = Daemon::on(Rig::small()).started();
+    daemon.ready();
+    let id = open(&daemon);
+    while names(&view(&daemon, &id)).len() < 6 {}
+    let all = names(&state(&daemon, &id));
+    let consistent = |daemon: &Daemon, session: &Value, closed: &str| {
+        let file = daemon.get(&format!("/v1/calibrations/{id}/calibration.toml"));
+        assert_eq!(names(session), all, "{session}");
+        if session["state"] == "done" {
+            let file: toml::Table = String::from_utf8(file.expect(200).body).expect("text").parse().expect("TOML");
+            assert!(file.contains_key("projector"));
+        } else {
+            assert_eq!(session["state"], closed, "{session}");
+            file.expect(404);
+        }
+    };
+    for pause_ms in [0, 20, 60, 150] {
+        begin(&daemon, &id, "solve").expect(202);
+        std::thread::sleep(Duration::from_millis(pause_ms));
+        daemon.kill();
+        daemon.start();
+        daemon.ready();
+        let after = state(&daemon, &id);
+        consistent(&daemon, &after, "open");
+        if after["state"] == "done" {
+            return;
+        }
+    }
+    begin(&daemon, &id, "solve").expect(202);
+    begin(&daemon, &id, "cancel").expect(202);
+    let after = settled(&daemon, &id);
+    consistent(&daemon, &after, "cancelled");
+}
+
+#[test]
+fn a_view_without_a_board_is_refused_by_name_and_the_session_goes_on() {
+    let daemon = Daemon::fast();
+    daemon.ready();
+    // Squares of a fifth of a camera pixel: nothing of it is seen.
+    let tiny = json!({ "pattern": { "checkerboard": { "columns": 9, "rows": 6, "square_mm": 0.2 } } });
+    let session = daemon.post("/v1/calibrations/rig", &json!({ "board": tiny })).expect(202).json();
+    let id = session["id"].as_str().expect("an identity").to_owned();
+    let session = step(&daemon, &id, "views");
+    assert_eq!(session["state"], "open", "{session}");
+    let told = [&session["error"]["message"], &session["session"]["views"][0]["unusable"]];
+    let told = told.into_iter().find_map(Value::as_str).unwrap_or_else(|| panic!("{session}"));
+    assert!(told.contains("board"), "{told}");
+    let again = step(&daemon, &id, "views");
+    assert_eq!(again["state"], "open", "{again}");
+    begin(&daemon, &id, "cancel").expect(202);
+}

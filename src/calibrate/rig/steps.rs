@@ -89,6 +89,13 @@ pub struct SessionView {
     pub tilt_deg: Option<[f64; 2]>,
 }
 
+impl Task {
+    /// Whether the step moves the rig; the others only compute.
+    pub fn needs_rig(&self) -> bool {
+        self.step == Step::View
+    }
+}
+
 /// Carries a step out; a solution goes into the folder `out`, in the place of an earlier one.
 ///
 /// # Errors
@@ -101,6 +108,36 @@ pub fn run(
     cancel: &CancelFlag,
     doing: &mut dyn FnMut(&str),
 ) -> Result<Outcome, Failure> {
+    if !task.needs_rig() {
+        return compute(task, out, cancel, doing);
+    }
+    let folder = &task.folder;
+    let mut session = Session::read(folder)?;
+    let mut views = alive(cancel, || Views::recall(folder, &session))?;
+    let name = next_name(folder, &session)?;
+    doing(&format!("taking {name}"));
+    let one = add(&name, &session, folder, rig, settings, cancel, doing)?;
+    if let Err(error) = views.join(&one) {
+        // Another camera or projector than before: its frames are of no use to this session.
+        remove(folder, &name)?;
+        return Err(error);
+    }
+    one.remember(folder, &name)?;
+    session.views.push(name);
+    session.write(folder)?;
+    Ok(Outcome { session: Some(SessionState::of(&session, &views)?), ..Outcome::default() })
+}
+
+/// Carries out a step that needs no rig, as [`run`] does.
+///
+/// # Errors
+/// A view that is not there or cannot be read, the disk, or `cancel`.
+pub fn compute(
+    task: &Task,
+    out: &Path,
+    cancel: &CancelFlag,
+    doing: &mut dyn FnMut(&str),
+) -> Result<Outcome, Failure> {
     let Task { folder, step } = task;
     let mut session = Session::read(folder)?;
     if let Step::Drop(name) = step {
@@ -109,27 +146,11 @@ pub fn run(
         session.write(folder)?;
         remove(folder, name)?;
     }
-    let mut views = alive(cancel, || Views::recall(folder, &session))?;
+    let views = alive(cancel, || Views::recall(folder, &session))?;
     let mut outcome = Outcome::default();
-    match step {
-        Step::Drop(_) => {}
-        Step::View => {
-            let name = next_name(folder, &session)?;
-            doing(&format!("taking {name}"));
-            let one = add(&name, &session, folder, rig, settings, cancel, doing)?;
-            if let Err(error) = views.join(&one) {
-                // Another camera or projector than before: its frames are of no use to this session.
-                remove(folder, &name)?;
-                return Err(error);
-            }
-            one.remember(folder, &name)?;
-            session.views.push(name);
-            session.write(folder)?;
-        }
-        Step::Solve => {
-            doing("solving");
-            outcome = alive(cancel, || solution(&session, &views, out))?;
-        }
+    if *step == Step::Solve {
+        doing("solving");
+        outcome = alive(cancel, || solution(&session, &views, out))?;
     }
     outcome.session = Some(SessionState::of(&session, &views)?);
     Ok(outcome)

@@ -77,7 +77,7 @@ impl Owner {
         self.start_calibration(record, ask.task)
     }
 
-    /// Gives the rig to a calibration that was admitted.
+    /// Gives the rig to a calibration that was admitted, or the computing threads where they are enough.
     pub(super) fn start_calibration(
         &mut self,
         mut record: CalibrationRecord,
@@ -89,11 +89,22 @@ impl Owner {
         store.write(&record).map_err(|error| Denied::Storage(chain(&error)))?;
         Arc::make_mut(&mut self.calibrations).insert(id.clone(), Arc::new(record));
         let cancel = CancelFlag::default();
-        let job = Job { id: id.clone(), task, cancel: cancel.clone(), folder: store.files(&id) };
-        let _ = self.out.rig.send(rig::Command::Calibrate(Box::new(job)));
-        self.calibrating = Some(Calibrating { id: id.clone(), cancel, looks: 0 });
-        self.rig.state = RigState::Busy;
-        self.rig.showing = None;
+        let folder = store.files(&id);
+        let one = Calibrating { id: id.clone(), cancel: cancel.clone(), looks: 0 };
+        match task {
+            Task::Rig(task) if !task.needs_rig() => {
+                let step = finish::Step { id: id.clone(), task, cancel, folder };
+                let _ = self.out.finish.send(Work::Step(Box::new(step)));
+                self.stepping = Some(one);
+            }
+            task => {
+                let job = Job { id: id.clone(), task, cancel, folder };
+                let _ = self.out.rig.send(rig::Command::Calibrate(Box::new(job)));
+                self.calibrating = Some(one);
+                self.rig.state = RigState::Busy;
+                self.rig.showing = None;
+            }
+        }
         self.touch_calibration(&id);
         self.calibration(&id)
     }
@@ -102,7 +113,8 @@ impl Owner {
         let record = self.calibration(id)?;
         match record.state {
             CalibrationState::Running => {
-                self.calibrating.iter().filter(|one| one.id == id).for_each(|one| one.cancel.cancel());
+                let running = self.calibrating.iter().chain(&self.stepping);
+                running.filter(|one| one.id == id).for_each(|one| one.cancel.cancel());
                 Ok(record)
             }
             CalibrationState::Open => self.close_session(id),
@@ -115,7 +127,11 @@ impl Owner {
 
     /// The calibration that has the rig, as scans are told of it.
     pub(super) fn calibration_holder(&self) -> Option<Holder> {
-        let record = self.calibrations.get(&self.calibrating.as_ref()?.id)?;
+        self.calibration_as_holder(&self.calibrating.as_ref()?.id)
+    }
+
+    pub(super) fn calibration_as_holder(&self, id: &str) -> Option<Holder> {
+        let record = self.calibrations.get(id)?;
         Some(Holder {
             id: record.id.clone(),
             state: State::Projecting,
@@ -147,8 +163,12 @@ impl Owner {
     }
 
     fn calibration_ended(&mut self, id: &str, result: Result<Box<crate::calibrate::Outcome>, Broken>) {
-        let stopped = self.calibrating.take().is_some_and(|one| one.cancel.is_cancelled());
-        self.release();
+        let had_rig = self.calibrating.as_ref().is_some_and(|one| one.id == id);
+        let one = if had_rig { self.calibrating.take() } else { self.stepping.take() };
+        if had_rig {
+            self.release();
+        }
+        let stopped = one.is_some_and(|one| one.cancel.is_cancelled());
         let Some(mut record) = self.calibrations.get(id).map(|record| record.as_ref().clone()) else {
             return;
         };

@@ -114,6 +114,7 @@ pub struct Owner {
     /// Why captures that did not come to their end did not.
     cut_short: BTreeMap<String, Diagnosis>,
     calibrating: Option<Calibrating>,
+    stepping: Option<Calibrating>,
     calibrations: Arc<BTreeMap<String, Arc<CalibrationRecord>>>,
     rig: RigStatus,
     storage: StorageStatus,
@@ -161,6 +162,7 @@ impl Owner {
             accepted: BTreeMap::new(),
             cut_short: BTreeMap::new(),
             calibrating: None,
+            stepping: None,
             calibrations: Arc::default(),
             rig: RigStatus::default(),
             storage,
@@ -201,7 +203,8 @@ impl Owner {
                 if self.stop_by.is_some_and(|limit| Instant::now() >= limit) {
                     self.cancel.values().for_each(CancelFlag::cancel);
                 }
-                if self.active.is_none() && self.finishing.is_empty() && self.calibrating.is_none() {
+                let calibrates = self.calibrating.is_some() || self.stepping.is_some();
+                if self.active.is_none() && self.finishing.is_empty() && !calibrates {
                     break;
                 }
             }

@@ -121,6 +121,7 @@ impl Owner {
                 }
             }
             finish::News::Finished { id, result } => self.finished(&id, result),
+            finish::News::Calibration { id, said } => self.calibration_news(&id, said),
         }
     }
 

@@ -300,7 +300,7 @@ impl Owner {
         self.stopping = true;
         self.stop_by = Some(Instant::now() + grace);
         // A measurement has nothing that could be kept, and can be asked for again.
-        self.calibrating.iter().for_each(|one| one.cancel.cancel());
+        self.calibrating.iter().chain(&self.stepping).for_each(|one| one.cancel.cancel());
         // Decodes that have not begun can be asked for again; queued scans stay queued.
         tracing::info!(grace_s = grace.as_secs_f64(), "stopping");
     }

@@ -57,17 +57,33 @@ impl Owner {
         };
         match (&record.state, &step) {
             (CalibrationState::Open, Step::Drop(name)) if !known(name) => return Err(Denied::UnknownView),
-            // Whoever runs has the rig, which admission says.
-            (CalibrationState::Open | CalibrationState::Running, _) => {}
+            (CalibrationState::Open, _) => {}
+            (CalibrationState::Running, _) => {
+                let holder = self.calibration_as_holder(id).ok_or(Denied::UnknownCalibration)?;
+                return Err(Denied::Refused(Refusal::Busy(holder)));
+            }
             (state, _) => return Err(Denied::CalibrationEnded(*state)),
         }
-        self.admit_calibration()?;
+        self.admit_step(&step)?;
         let mut running = record.as_ref().clone();
         running.state = CalibrationState::Running;
         // Whatever the step brings, an earlier solution is one of other views.
         (running.files, running.summary, running.refused) = Default::default();
         running.accepted = None;
         self.start_calibration(running, Task::Rig(calibrate::rig::Task { folder, step }))
+    }
+
+    /// A view needs the rig; a solution only space for its files; dropping a view makes some.
+    fn admit_step(&mut self, step: &Step) -> Result<(), Denied> {
+        let minds: &[&str] = match step {
+            Step::View => return self.admit_calibration(),
+            Step::Solve => &["stopping", "storage"],
+            Step::Drop(_) => &["stopping"],
+        };
+        self.look_at_storage();
+        let mut obstacles = self.obstacles();
+        obstacles.retain(|obstacle| minds.contains(&obstacle.kind.as_str()));
+        if obstacles.is_empty() { Ok(()) } else { Err(Denied::Refused(Refusal::NotReady(obstacles))) }
     }
 
     /// A step came to its end: the session stays open, unless its calibration was accepted or somebody closed it.
