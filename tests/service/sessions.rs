@@ -262,7 +262,8 @@ fn a_solve_that_is_cut_short_leaves_all_or_nothing() {
         let file = daemon.get(&format!("/v1/calibrations/{id}/calibration.toml"));
         assert_eq!(names(session), all, "{session}");
         if session["state"] == "done" {
-            let file: toml::Table = String::from_utf8(file.expect(200).body).expect("text").parse().expect("TOML");
+            let file: toml::Table =
+                String::from_utf8(file.expect(200).body).expect("text").parse().expect("TOML");
             assert!(file.contains_key("projector"));
         } else {
             assert_eq!(session["state"], closed, "{session}");

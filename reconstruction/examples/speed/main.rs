@@ -6,16 +6,22 @@ mod measure;
 
 use std::{fmt::Write, fs, path::Path};
 
-use measure::{Others, Outcome, Times, bundles, others, times};
+use measure::{Bundle, Others, Outcome, Times, bundles, decode_times, others, stacked, times};
+use polscan_patterns::ProjectorSize;
 
 /// Sensor of the scans that are measured.
 const SENSOR: (usize, usize) = (1600, 1200);
+const PROJECTOR: ProjectorSize = ProjectorSize { width: 1024, height: 768 };
+/// Camera pixels of the scaling table, in sensors.
+const STACKS: [usize; 5] = [1, 2, 4, 8, 16];
+/// Projectors of the other one.
+const PROJECTORS: [[u32; 2]; 4] = [[512, 384], [1024, 768], [2048, 1080], [4096, 2160]];
 
 fn main() -> Outcome<()> {
     let only = std::env::args().nth(1);
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).parent().ok_or("this crate lies in no workspace")?;
     eprintln!("speed: rendering frames");
-    let both = bundles(SENSOR.0, SENSOR.1)?;
+    let both = bundles(SENSOR, PROJECTOR)?;
     let mut measured = Vec::new();
     for bundle in &both {
         for threads in [1, 2] {
@@ -37,7 +43,11 @@ fn main() -> Outcome<()> {
     }
     eprintln!("speed: OpenCV and numpy");
     let others = others(root, &both[0], 5)?;
-    let page = page(&measured, &others)?;
+    let mut page = page(&measured, &others)?;
+    eprintln!("speed: more pixels");
+    page.push_str(&more_pixels(&both)?);
+    eprintln!("speed: other projectors");
+    page.push_str(&other_projectors()?);
     print!("{page}");
     fs::write(root.join("docs/speed.md"), page)?;
     Ok(())
@@ -97,6 +107,66 @@ fn page(measured: &[Times], others: &Others) -> Result<String, std::fmt::Error> 
     out.push_str(STAGES);
     Ok(out)
 }
+
+/// Times of as many pixels and more.
+fn more_pixels(both: &[Bundle]) -> Outcome<String> {
+    let mut out = String::from(MORE_PIXELS);
+    for bundle in both {
+        let mut rows = Vec::new();
+        for stack in STACKS {
+            let stacked = stacked(bundle, stack);
+            rows.push((stack, [decode_times(&stacked, 1)?.0, decode_times(&stacked, 2)?.0]));
+        }
+        for (stack, found) in &rows {
+            write!(out, "| {} | x{stack} |", bundle.name)?;
+            for (at, [read_ms, codes_ms, decode_ms]) in found.iter().enumerate() {
+                let once = |kind: usize| rows[0].1[at][kind] * *stack as f64;
+                write!(out, " {read_ms:.1} | {codes_ms:.0} ({:.2}) |", codes_ms / once(1))?;
+                write!(out, " {decode_ms:.0} ({:.2}) |", decode_ms / once(2))?;
+            }
+            writeln!(out)?;
+        }
+    }
+    Ok(out)
+}
+
+/// Times of other projectors, which take other numbers of frames.
+fn other_projectors() -> Outcome<String> {
+    let mut out = String::from(OTHER_PROJECTORS);
+    for [width, height] in PROJECTORS {
+        let [bytes, _] = bundles(SENSOR, ProjectorSize { width, height })?;
+        let frames = bytes.frames.len();
+        let mut row = format!("| {width}x{height} | {frames} |");
+        let mut share = 0.0;
+        for threads in [1, 2] {
+            let ([read_ms, codes_ms, decode_ms], valid) = decode_times(&bytes, threads)?;
+            share = valid;
+            let per_frame = codes_ms / frames as f64;
+            write!(row, " {read_ms:.1} | {codes_ms:.1} | {per_frame:.2} | {decode_ms:.0} |")?;
+        }
+        writeln!(out, "{row} {:.0} |", 100.0 * share)?;
+    }
+    Ok(out)
+}
+
+const MORE_PIXELS: &str = "
+## More pixels, ms
+
+The same scan stacked, so that everything but the size is equal. In brackets the time over as many times the first
+row's: 1 is linear.
+
+| frames | pixels | read, 1 thread | codes | with sub-pixel | read, 2 threads | codes | with sub-pixel |
+|---|---|---|---|---|---|---|---|
+";
+
+const OTHER_PROJECTORS: &str = "
+## Other projectors, 8 bit, ms
+
+The same camera of 1600x1200 px, which does not resolve the finest stripes of the largest.
+
+| projector | frames | read, 1 thread | codes | codes per frame | with sub-pixel | read, 2 threads | codes | codes per frame | with sub-pixel | pixels decoded, % |
+|---|---|---|---|---|---|---|---|---|---|---|
+";
 
 const INTRODUCTION: &str = "# Speed
 

@@ -66,15 +66,17 @@ pub struct Others {
 }
 
 /// The same scan as 8 bits and as 12 bits in `u16`: two plates, one behind the other and tilted, on a dark ground.
-pub fn bundles(width: usize, height: usize) -> Outcome<[Bundle; 2]> {
-    let mut sequence = Sequence::new(Mode::Pse, ProjectorSize { width: 1024, height: 768 })?;
+pub fn bundles((width, height): (usize, usize), projector: ProjectorSize) -> Outcome<[Bundle; 2]> {
+    let mut sequence = Sequence::new(Mode::Pse, projector)?;
     // A plain code is one that OpenCV knows too.
-    (sequence.column, sequence.row) = (AxisCode::plain(1024)?, AxisCode::plain(768)?);
+    (sequence.column, sequence.row) = (AxisCode::plain(projector.width)?, AxisCode::plain(projector.height)?);
     let rig = Rig { width, height, ..Rig::default() };
     let focal = 2.0 * width as f64;
     let (cx, cy) = ((width as f64 - 1.0) / 2.0, (height as f64 - 1.0) / 2.0);
     let baseline_mm = 100.0;
-    let (projector_focal, projector_cx, projector_cy) = (1700.0, 681.5, 383.5);
+    let share = f64::from(projector.width) / 1024.0;
+    let projector_cy = (f64::from(projector.height) - 1.0) / 2.0;
+    let (projector_focal, projector_cx) = (1700.0 * share, 682.0 * share - 0.5);
     let scene = |x: f64, y: f64| {
         let (a, b) = ((x - cx) / focal, (y - cy) / focal);
         let near = a > 0.05 && a < 0.15 && b.abs() < 0.1;
@@ -114,7 +116,13 @@ pub fn bundles(width: usize, height: usize) -> Outcome<[Bundle; 2]> {
     let calibration = Calibration {
         camera: lens(width, height, focal, cx, cy),
         projector: Some(Projector {
-            lens: lens(1024, 768, projector_focal, projector_cx, projector_cy),
+            lens: lens(
+                projector.width as usize,
+                projector.height as usize,
+                projector_focal,
+                projector_cx,
+                projector_cy,
+            ),
             projector_from_camera: pose,
         }),
         world_from_camera: None,
@@ -137,6 +145,51 @@ pub fn bundles(width: usize, height: usize) -> Outcome<[Bundle; 2]> {
         },
         Bundle { name: "12 bit in u16", frames: words, settings, calibration },
     ])
+}
+
+/// The same scan over and over, one below the other, `times` as many pixels in all.
+pub fn stacked(bundle: &Bundle, times: usize) -> Bundle {
+    let stack = |plane: &SharedPlane| -> SharedPlane {
+        match plane.plane() {
+            Plane::U8(samples) => Arc::new(samples.repeat(times)),
+            Plane::U16(samples) => Arc::new(samples.repeat(times)),
+        }
+    };
+    let settings = DecodeSettings { height: bundle.settings.height * times, ..bundle.settings.clone() };
+    let frames = bundle.frames.iter().map(|(role, plane)| (*role, stack(plane))).collect();
+    Bundle { name: bundle.name, frames, settings, calibration: bundle.calibration.clone() }
+}
+
+/// Least times of a plain read, of the codes, and of the decode up to complete maps, in ms, and the share of the pixels that
+/// are decoded.
+pub fn decode_times(bundle: &Bundle, threads: usize) -> Outcome<([f64; 3], f64)> {
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build()?;
+    pool.install(|| {
+        let Bundle { frames, settings, .. } = bundle;
+        let read_ms = least(|| {
+            black_box(read(frames, settings.height));
+        });
+        let mut accumulator = Accumulator::new(settings.clone())?;
+        for (role, plane) in frames {
+            accumulator.push(*role, plane.clone())?;
+        }
+        let decoded = accumulator.clone().finish()?;
+        let valid = decoded.class.data().iter().filter(|class| class.is_valid()).count();
+        let [codes_ms, decode_ms] = whole(&accumulator);
+        Ok(([read_ms, codes_ms, decode_ms], valid as f64 / decoded.class.len() as f64))
+    })
+}
+
+/// Least times of the codes, and of the decode up to complete maps, in ms.
+fn whole(accumulator: &Accumulator) -> [f64; 2] {
+    let mut codes_ms = f64::INFINITY;
+    let decode_ms = least(|| {
+        let start = Instant::now();
+        let codes_done = || codes_ms = codes_ms.min(1e3 * start.elapsed().as_secs_f64());
+        black_box(accumulator.clone().finish_telling(codes_done))
+            .expect("frames that have just decoded do so again");
+    });
+    [codes_ms, decode_ms]
 }
 
 /// Least time of `work` in ms over at least three runs, more where they are short.
@@ -227,15 +280,9 @@ fn times_here(bundle: &Bundle, threads: usize, only: Option<&str>) -> Outcome<Ti
     visit("contrast", &mut || {
         black_box(contrast(&code, &dark, settings.camera.bit_depth, 0.0, &lit));
     });
-    let mut codes_ms = f64::INFINITY;
-    let decode_ms = match only {
-        Some(_) => f64::INFINITY,
-        None => least(|| {
-            let start = Instant::now();
-            let codes_done = || codes_ms = codes_ms.min(1e3 * start.elapsed().as_secs_f64());
-            black_box(accumulator.clone().finish_telling(codes_done))
-                .expect("frames that have just decoded do so again");
-        }),
+    let [codes_ms, decode_ms] = match only {
+        Some(_) => [f64::INFINITY; 2],
+        None => whole(&accumulator),
     };
     if found.cloud.points() < decoded.class.len() / 3 {
         return Err(format!("only {} points came of these frames", found.cloud.points()).into());
