@@ -33,6 +33,24 @@ def test_a_cloud_is_what_the_service_wrote(service: Service, scanner: Scanner) -
     assert (cloud["sigma_z"] > 0).all()
 
 
+def test_a_sample_is_a_part_of_the_cloud(scanner: Scanner) -> None:
+    scan = scanner.scan(mode="pse")
+    cloud = np.ascontiguousarray(scan.cloud())
+    few = scan.sample(500)
+    assert (len(few), few.dtype) == (500, polscan.CLOUD)
+    # In the order of the cloud, and none of them twice.
+    places = {point.tobytes(): place for place, point in enumerate(cloud)}
+    found = [places[point.tobytes()] for point in few]
+    assert found == sorted(set(found))
+    # From each stretch of it: the gap between two is never that of three.
+    assert np.diff(found).max() < 3 * len(cloud) / 500
+    assert len(scan.sample(200_000)) == min(len(cloud), 200_000)
+    with pytest.raises(polscan.Invalid, match="points"):
+        scan.sample(0)
+    with pytest.raises(polscan.ScanFailed):
+        scanner.scan(exposure_us=1).sample()
+
+
 def test_a_cloud_may_be_changed_and_its_file_stays_as_it_is(scanner: Scanner, tmp_path: Path) -> None:
     scan = scanner.scan(mode="fast")
     cloud = scan.cloud(tmp_path / "part.ply")

@@ -69,9 +69,11 @@ pub struct Artifact {
 }
 
 /// A file on the disk.
-struct Found {
-    path: PathBuf,
-    entry: FileEntry,
+pub(super) struct Found {
+    /// Where it is.
+    pub path: PathBuf,
+    /// What the manifest says of it.
+    pub entry: FileEntry,
 }
 
 /// Reads the manifest of a bundle; the hash of the file itself comes with it.
@@ -111,7 +113,7 @@ pub(super) fn not_finished(record: &Record) -> Problem {
 }
 
 /// Finds a file by a name that the manifest lists.
-async fn locate(app: &App, id: &str, name: &str) -> Result<Found, Problem> {
+pub(super) async fn locate(app: &App, id: &str, name: &str) -> Result<Found, Problem> {
     let record = find(app, id).await?;
     let expected = EXPECTED.contains(&name) || (name.starts_with("maps/") && name.ends_with(".png"));
     if !record.state.is_terminal() {

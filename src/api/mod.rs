@@ -11,6 +11,7 @@ mod linger;
 mod live;
 mod pages;
 mod problem;
+mod samples;
 mod scans;
 mod server;
 mod sessions;
@@ -147,6 +148,7 @@ fn router() -> OpenApiRouter<App> {
         .routes(routes!(artifacts::get_bundle))
         .routes(routes!(artifacts::get_summary))
         .routes(routes!(artifacts::get_artifact))
+        .routes(routes!(samples::get_sample))
         .routes(routes!(artifacts::get_map))
         .routes(routes!(exports::get_export))
         .routes(routes!(scans::resume_queue))

@@ -83,7 +83,7 @@ export class CloudView {
   private readonly controls: OrbitControls;
   private readonly geometry = new BufferGeometry();
   private readonly material = new PointsMaterial({ size: 2, sizeAttenuation: false, vertexColors: true });
-  private readonly order: Uint32Array;
+  private order: Uint32Array = new Uint32Array();
   private readonly marker: Line;
   private readonly middle = new Vector3();
   private radius = 1;
@@ -94,21 +94,24 @@ export class CloudView {
   private dirty = true;
   private moving = false;
   private marked = false;
-  private turning = !matchMedia("(prefers-reduced-motion: reduce)").matches;
+  private turning: boolean;
   private readonly begun = performance.now();
   private alive = true;
   private pointSize = 2;
   private readonly resized: ResizeObserver;
 
+  /** Shows `cloud`, which turns by itself at first where `turns`. */
   constructor(
     private readonly canvas: HTMLCanvasElement,
-    private readonly cloud: Cloud,
+    private cloud: Cloud,
+    turns = true,
   ) {
+    this.turning = turns && !matchMedia("(prefers-reduced-motion: reduce)").matches;
     this.renderer = new WebGLRenderer({ canvas, preserveDrawingBuffer: true, powerPreference: "high-performance" });
     this.renderer.autoClear = false;
     this.scene.background = null;
     this.renderer.setClearColor(new Color(0x0b0e14));
-    this.order = spread(cloud.count);
+    this.frame();
     this.place();
     this.marker = new Line(new BufferGeometry(), new LineBasicMaterial({ color: 0xffffff, depthTest: false }));
     this.marker.frustumCulled = false;
@@ -122,7 +125,6 @@ export class CloudView {
     this.controls.addEventListener("change", () => this.touched());
     this.resized = new ResizeObserver(() => this.resize());
     this.resized.observe(canvas.parentElement ?? canvas);
-    this.figures.points = cloud.count;
     this.resize();
     this.front();
     const loop = (now: number) => {
@@ -133,9 +135,28 @@ export class CloudView {
     requestAnimationFrame(loop);
   }
 
-  /** Puts the points in the order of drawing, about the cloud's middle, with y and z turned as the screen has them. */
-  private place(): void {
+  /** Shows another cloud from where the operator looks now; from the front where it lies elsewhere. */
+  replace(cloud: Cloud): void {
+    const [middle, radius] = [this.middle.clone(), this.radius];
+    this.cloud = cloud;
+    this.mark([]);
+    this.frame();
+    const elsewhere = this.middle.distanceTo(middle) > radius || this.radius > 2 * radius || this.radius < radius / 4;
+    if (!elsewhere) {
+      this.middle.copy(middle);
+      this.radius = radius;
+    }
+    // Frees what the driver holds of the cloud before.
+    this.geometry.dispose();
+    this.place();
+    if (elsewhere) this.front();
+    this.touched();
+  }
+
+  /** Finds where the cloud is and how large; an empty one is where the one before was. */
+  private frame(): void {
     const { positions, count } = this.cloud;
+    if (count === 0) return;
     const axis = (offset: number): [number, number] => {
       const values = new Float32Array(count);
       for (let index = 0; index < count; index++) values[index] = positions[index * 3 + offset];
@@ -144,6 +165,14 @@ export class CloudView {
     const [x, y, z] = [axis(0), axis(1), axis(2)];
     this.middle.set((x[0] + x[1]) / 2, (y[0] + y[1]) / 2, (z[0] + z[1]) / 2);
     this.radius = Math.max(1e-3, Math.hypot(x[1] - x[0], y[1] - y[0], z[1] - z[0]) / 2);
+  }
+
+  /** Puts the points in the order of drawing, about the middle, with y and z turned as the screen has them. */
+  private place(): void {
+    const { positions, count } = this.cloud;
+    this.order = spread(count);
+    this.figures.points = count;
+    this.shown = 0;
     const placed = new Float32Array(count * 3);
     for (let index = 0; index < count; index++) {
       const from = this.order[index] * 3;

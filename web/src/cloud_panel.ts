@@ -1,19 +1,13 @@
 /** The cloud with its tools. */
 
 import { bytes } from "./api";
-import type { CloudView, Colouring, Legend } from "./cloud";
+import type { CloudView, Colouring } from "./cloud";
 import { choice, count, field, h, say } from "./dom";
+import { COLOURINGS, showLegend } from "./legend";
 import { readPly, type Cloud } from "./ply";
 import { distance, fitLine, section, type Point, type Profile, type Line } from "./section";
 
 type Tool = "turn" | "distance" | "section";
-
-const COLOURINGS: [Colouring, string][] = [
-  ["depth", "depth"],
-  ["sigma", "uncertainty (σ)"],
-  ["class", "class"],
-  ["intensity", "brightness"],
-];
 
 const TOOLS: [Tool, string][] = [
   ["turn", "turn"],
@@ -26,22 +20,6 @@ const HELP: Record<Tool, string> = {
   distance: "Point at two places of the cloud. Keys: arrows turn the cloud under the cross, Enter takes the point there.",
   section: "Point at both ends of the section. Keys: arrows turn the cloud under the cross, Enter takes the point there.",
 };
-
-function showLegend(box: HTMLElement, legend: Legend, by: Colouring): void {
-  box.replaceChildren();
-  if (!legend) return;
-  if ("names" in legend) {
-    for (const [name, colour] of legend.names) {
-      const sign = h("span", { class: "sign" });
-      sign.style.background = colour;
-      box.append(h("span", { class: "entry" }, sign, name));
-    }
-    return;
-  }
-  const unit = by === "intensity" ? "" : " mm";
-  const digits = by === "sigma" ? 3 : by === "depth" ? 1 : 0;
-  box.append(h("span", {}, `${legend.low.toFixed(digits)}${unit}`), h("span", { class: by === "intensity" ? "bar grey" : "bar" }), h("span", {}, `${legend.high.toFixed(digits)}${unit}`));
-}
 
 function plot(canvas: HTMLCanvasElement, profile: Profile, line: Line | null): void {
   const context = canvas.getContext("2d");

@@ -601,6 +601,19 @@ class AsyncScan:
         with tempfile.TemporaryDirectory(prefix="polscan-") as folder:
             return read_cloud(await self.fetch("cloud.ply", to or Path(folder) / "cloud.ply"))
 
+    async def sample(self, points: int = 50_000) -> NDArray[np.void]:
+        """Waits for the scan and returns at most `points` of its points (200 000 at the most), spread evenly over the image.
+
+        For a look at many clouds, one after the other; the fields are those of `cloud`.
+        """
+        await self.done()
+        path, params = f"{self.href}/sample.ply", {"points": str(points)}
+        answer = await self.scanner._send("GET", path, params=params)
+        with tempfile.TemporaryDirectory(prefix="polscan-") as folder:
+            file = Path(folder) / "sample.ply"
+            file.write_bytes(answer.content)
+            return read_cloud(file)
+
     async def maps(self, to: str | Path | None = None) -> dict[str, NDArray[Any]]:
         """Waits for the scan and returns its maps by name, of shape (height, width); see `polscan.Maps`.
 

@@ -7,7 +7,7 @@ mod reconstruct;
 mod surface;
 
 pub use plane::{PlaneError, PlaneFit, fit_plane};
-pub use ply::{CloudFrame, PlyError, PlyPoint, read_ply, write_ply};
+pub use ply::{CloudFrame, PlyError, PlyPoint, SampleError, read_ply, sample_ply, write_ply};
 pub use reconstruct::{
     DEFAULT_ROW_GATE_PX, ReconstructError, ReconstructSettings, reconstruct, reconstruct_with,
 };

@@ -1,11 +1,15 @@
 //! Point clouds as binary little-endian PLY.
 
+mod sample;
+
 use std::io::{self, BufWriter, Write};
 
 use thiserror::Error;
 
 use super::Cloud;
 use crate::grid::Grid;
+
+pub use sample::{SampleError, sample_ply};
 
 /// Properties of a vertex in order, with their PLY types: public, and tested from outside.
 const PROPERTIES: [(&str, &str); 9] = [
@@ -110,29 +114,48 @@ fn header(count: usize, frame: CloudFrame) -> String {
 /// # Errors
 /// [`PlyError`] for anything else, never a panic.
 pub fn read_ply(bytes: &[u8]) -> Result<Vec<PlyPoint>, PlyError> {
-    let bad = |what: &str| PlyError(what.to_owned());
-    let marker = b"end_header\n";
-    let head = &bytes[..bytes.len().min(MAX_HEADER)];
-    let end =
-        head.windows(marker.len()).position(|w| w == marker).ok_or_else(|| bad("the header has no end"))?;
-    let text = std::str::from_utf8(&head[..end]).map_err(|_| bad("the header is no text"))?;
-    let mut lines = text.lines().filter(|line| !line.starts_with("comment"));
-    if lines.next() != Some("ply") || lines.next() != Some("format binary_little_endian 1.0") {
-        return Err(bad("it is not binary little endian PLY 1.0"));
-    }
-    let count: usize = lines
-        .next()
-        .and_then(|line| line.strip_prefix("element vertex "))
-        .and_then(|count| count.parse().ok())
-        .ok_or_else(|| bad("its first element is not the vertices"))?;
-    if !lines.eq(PROPERTIES.iter().map(|(kind, name)| format!("property {kind} {name}"))) {
-        return Err(bad("its properties are not those of a scan"));
-    }
-    let body = &bytes[end + marker.len()..];
-    if count.checked_mul(VERTEX_BYTES) != Some(body.len()) {
-        return Err(bad("its length does not match the number of vertices"));
+    let head = Head::read(&bytes[..bytes.len().min(MAX_HEADER)])?;
+    let body = &bytes[head.bytes..];
+    if head.vertices.checked_mul(VERTEX_BYTES) != Some(body.len()) {
+        return Err(length_differs());
     }
     Ok(body.chunks_exact(VERTEX_BYTES).map(vertex).collect())
+}
+
+fn length_differs() -> PlyError {
+    PlyError("its length does not match the number of vertices".to_owned())
+}
+
+/// What comes before the vertices.
+struct Head<'a> {
+    text: &'a str,
+    /// Its length with the line that ends it.
+    bytes: usize,
+    vertices: usize,
+}
+
+impl<'a> Head<'a> {
+    /// Reads it from the beginning of a file, of which `bytes` are the first.
+    fn read(bytes: &'a [u8]) -> Result<Self, PlyError> {
+        let bad = |what: &str| PlyError(what.to_owned());
+        let marker = b"end_header\n";
+        let end = bytes.windows(marker.len()).position(|w| w == marker);
+        let end = end.ok_or_else(|| bad("the header has no end"))?;
+        let text = std::str::from_utf8(&bytes[..end]).map_err(|_| bad("the header is no text"))?;
+        let mut lines = text.lines().filter(|line| !line.starts_with("comment"));
+        if lines.next() != Some("ply") || lines.next() != Some("format binary_little_endian 1.0") {
+            return Err(bad("it is not binary little endian PLY 1.0"));
+        }
+        let vertices: usize = lines
+            .next()
+            .and_then(|line| line.strip_prefix("element vertex "))
+            .and_then(|count| count.parse().ok())
+            .ok_or_else(|| bad("its first element is not the vertices"))?;
+        if !lines.eq(PROPERTIES.iter().map(|(kind, name)| format!("property {kind} {name}"))) {
+            return Err(bad("its properties are not those of a scan"));
+        }
+        Ok(Self { text, bytes: end + marker.len(), vertices })
+    }
 }
 
 fn vertex(bytes: &[u8]) -> PlyPoint {
