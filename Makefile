@@ -1,5 +1,5 @@
 # Two commands are all that is needed: `make run` and `make test`. Both install what is missing first.
-.PHONY: run serve test captures foreign-plane exports python page page-test closed-loop faults soak kills service-figures fuzz accuracy bench api-fuzz systemd v4l2 book documents deb setup install ci
+.PHONY: run serve test captures foreign-plane exports python page page-test closed-loop faults soak kills service-figures fuzz accuracy bench api-fuzz systemd v4l2 rerun-test book documents deb setup install ci
 
 run: ## build, serve the simulated rig, scan it over REST, say where the results are
 	@scripts/install build
@@ -80,6 +80,10 @@ systemd: ## as root: the package, installed in a container with a systemd of its
 v4l2: ## the driver of V4L2 cameras, on a kernel with a camera of its own in a virtual machine; about 2 minutes
 	@scripts/install v4l2
 	@scripts/v4l2-test
+
+rerun-test: ## clouds in recordings and in a viewer of Rerun (220 MB the first time)
+	@scripts/install rerun
+	@scripts/rerun-test
 
 book: ## docs/ as a book, in target/book
 	@scripts/book
