@@ -102,7 +102,7 @@ def test_a_viewer_that_is_open_gets_scans_as_they_end(service: Service, tmp_path
     viewer = subprocess.Popen(
         [VIEWER, "--save", path, "--bind", "127.0.0.1", "--port", str(port)],
     )
-    processes = [viewer]
+    processes: list[subprocess.Popen[Any]] = [viewer]
     try:
         address = f"rerun+http://127.0.0.1:{port}/proxy"
         shower = subprocess.Popen(
