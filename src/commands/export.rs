@@ -48,6 +48,10 @@ impl Format {
             "pcd" => Some(Self::Pcd),
             "xyz" => Some(Self::Xyz),
             "obj" => Some(Self::Obj),
+            // As exports are called: the name says that it holds the values themselves.
+            "tif" | "tiff" if path.file_stem()?.to_str()?.to_ascii_lowercase().ends_with(".f32") => {
+                Some(Self::TiffF32)
+            }
             "tif" | "tiff" => Some(Self::Tiff),
             "png" => Some(Self::Png),
             _ => None,
@@ -174,7 +178,7 @@ fn plan(args: &ExportArgs) -> Result<Plan, String> {
 fn file(format: Format, args: &ExportArgs) -> Result<Plan, String> {
     let of_name = || {
         let stem = args.out.file_stem()?.to_str()?;
-        MapName::ALL.into_iter().find(|map| stem.trim_end_matches(".f32") == map.name())
+        MapName::ALL.into_iter().find(|map| stem.to_ascii_lowercase().trim_end_matches(".f32") == map.name())
     };
     let item = match (format.kind(), args.map.as_slice()) {
         (Kind::Cloud(format), []) => Item::Cloud(format),
@@ -331,6 +335,8 @@ mod tests {
             ("--out b.png --map mask", Item::Map(MapName::Mask, PictureFormat::Png)),
             ("--out b.tiff --format tiff-f32 --map row", Item::Map(MapName::Row, PictureFormat::TiffF32)),
             ("--out row.f32.tiff --format tiff-f32", Item::Map(MapName::Row, PictureFormat::TiffF32)),
+            ("--out row.f32.tiff", Item::Map(MapName::Row, PictureFormat::TiffF32)),
+            ("--out a/row.F32.TIF", Item::Map(MapName::Row, PictureFormat::TiffF32)),
         ];
         for (line, item) in one {
             assert_eq!(planned(line), Ok(Plan::File(item)), "{line}");
@@ -360,6 +366,8 @@ mod tests {
             "--out a.tiff --map depth,row",
             "--out a.e57 --map depth",
             "--out mask.tiff --format tiff-f32",
+            "--out mask.f32.tiff",
+            "--out depth.f32.tiff --format tiff",
             "--out folder --format tiff-f32 --map mask",
             "--out folder --format e57 --map depth",
         ];
