@@ -66,10 +66,16 @@ impl Soak {
     }
 }
 
-fn sample(process: u32, scans: usize) -> Sample {
+/// A size that the kernel tells of a process, such as `VmRSS`, in KiB.
+pub fn status_kib(process: u32, name: &str) -> u64 {
     let status = fs::read_to_string(format!("/proc/{process}/status")).expect("the process lives");
-    let memory = status.lines().find_map(|line| line.strip_prefix("VmRSS:")).expect("resident memory");
-    let memory_kib = memory.trim().trim_end_matches(" kB").parse().expect("a number");
+    let of_line =
+        |line: &str| line.strip_prefix(name)?.strip_prefix(':')?.trim().strip_suffix(" kB")?.parse().ok();
+    status.lines().find_map(of_line).expect("a size")
+}
+
+fn sample(process: u32, scans: usize) -> Sample {
+    let memory_kib = status_kib(process, "VmRSS");
     let descriptors = fs::read_dir(format!("/proc/{process}/fd")).expect("descriptors").count();
     Sample { scans, memory_kib, descriptors }
 }
@@ -222,4 +228,28 @@ fn scans_in_a_row_lose_no_event_and_hold_nothing_back() {
     let (least, most) = (descriptors.iter().min().unwrap(), descriptors.iter().max().unwrap());
     // A follower may be between two connections.
     assert!(most - least <= 3, "{:?}", run.samples);
+}
+
+/// Bytes of a pixel that a scan may take beside its frames: maps, points, and the files that are made of them.
+const MOST_BYTES_PER_PIXEL: u64 = 400;
+
+#[test]
+fn a_scan_takes_its_frames_once_and_its_maps() {
+    let daemon = Daemon::on(Rig::scaled(2.0)).started();
+    daemon.ready();
+    let before = status_kib(daemon.process(), "VmRSS");
+    let (mut grown, mut frames) = (Vec::new(), 0);
+    for _ in 0..3 {
+        let scan = daemon.done(&daemon.scan(&json!({ "mode": "pse" })));
+        assert_eq!(scan["state"], "done", "{scan}");
+        grown.push((status_kib(daemon.process(), "VmHWM") - before) << 10);
+        let bundle = daemon.store.join(scan["id"].as_str().expect("an identity"));
+        frames = fs::metadata(bundle.join("frames.npy")).expect("frames").len();
+    }
+    let pixels = 800 * 600;
+    println!("{grown:?} bytes beside {before} KiB; frames {frames}");
+    let [first, .., last] = grown[..] else { unreachable!("three scans") };
+    assert!(first < frames + MOST_BYTES_PER_PIXEL * pixels, "{first} bytes, of frames {frames}");
+    // What one scan needed is there for the next.
+    assert!(last < first + frames / 2, "{grown:?}");
 }

@@ -2,6 +2,7 @@
 //! while it decodes. And how near a capture comes to the pace of its display.
 
 use std::{
+    collections::HashMap,
     sync::atomic::{AtomicBool, Ordering},
     time::{Duration, Instant},
 };
@@ -12,6 +13,7 @@ use crate::{
     client::{Events, send},
     daemon::Daemon,
     rig::Rig,
+    soak::status_kib,
 };
 
 /// Scans of each figure.
@@ -46,6 +48,28 @@ fn describe(when: &str) {
     println!("{cores} cores, {build}, load {when} {}", load.trim());
 }
 
+/// What the service logs when light is on the object.
+struct FirstPattern {
+    scan: String,
+    after_accepted_ms: f64,
+    rehearsed_ms: f64,
+}
+
+/// Of all scans, in order.
+fn first_patterns(daemon: &Daemon) -> impl Iterator<Item = FirstPattern> {
+    let read = |line: &str| {
+        let said: Value = serde_json::from_str(line).ok()?;
+        let fields = &said["fields"];
+        (fields["message"] == "first pattern shown").then_some(())?;
+        Some(FirstPattern {
+            scan: said["span"]["id"].as_str()?.to_owned(),
+            after_accepted_ms: fields["after_accepted_ms"].as_f64()?,
+            rehearsed_ms: fields["rehearsed_ms"].as_f64()?,
+        })
+    };
+    daemon.log().lines().filter_map(read).collect::<Vec<_>>().into_iter()
+}
+
 /// From before the request is sent until light is on the object: an upper bound, as the answer's way back is counted in.
 #[test]
 fn figures_of_the_first_pattern() {
@@ -61,20 +85,76 @@ fn figures_of_the_first_pattern() {
         asked.push(begun.elapsed());
         assert_eq!(daemon.done(&id)["state"], "done");
     }
-    let log = daemon.log();
-    let shown = log.lines().filter_map(|line| {
-        let fields = &serde_json::from_str::<Value>(line).ok()?["fields"];
-        (fields["message"] == "first pattern shown")
-            .then(|| Some((fields["after_accepted_ms"].as_f64()?, fields["rehearsed_ms"].as_f64()?)))?
-    });
-    let shown: Vec<(f64, f64)> = shown.skip(1).collect();
+    let shown: Vec<FirstPattern> = first_patterns(&daemon).skip(1).collect();
     assert_eq!(shown.len(), SCANS);
-    let all = asked.iter().zip(&shown).map(|(asked, (shown, _))| ms(*asked) + shown).collect();
-    let own = asked.iter().zip(&shown).map(|(asked, (shown, rehearsed))| ms(*asked) + shown - rehearsed);
+    let all = asked.iter().zip(&shown).map(|(asked, shown)| ms(*asked) + shown.after_accepted_ms).collect();
+    let own = asked
+        .iter()
+        .zip(&shown)
+        .map(|(asked, shown)| ms(*asked) + shown.after_accepted_ms - shown.rehearsed_ms);
     say("request until its answer", asked.iter().map(|asked| ms(*asked)).collect());
-    say("rendering of the simulated rig in advance", shown.iter().map(|(_, rehearsed)| *rehearsed).collect());
+    say("rendering of the simulated rig in advance", shown.iter().map(|shown| shown.rehearsed_ms).collect());
     say("request until the first pattern is shown, at most", all);
     say("the same without what the simulated rig renders in advance", own.collect());
+    describe("after");
+}
+
+/// From before the process is started until `/readyz` says that a scan would be accepted.
+#[test]
+fn figures_of_the_start() {
+    describe("before");
+    let mut daemon = Daemon::on(Rig::scaled(1.0));
+    let (mut first, mut later) = (Vec::new(), Vec::new());
+    for number in 0..2 * PAIRS {
+        let begun = Instant::now();
+        daemon.start();
+        while send(daemon.address(), "GET", "/readyz", &[], b"").status != 200 {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        if number == 0 { &mut first } else { &mut later }.push(ms(begun.elapsed()));
+        daemon.stop();
+    }
+    say("start until ready, a store that is to be made", first);
+    say("start until ready", later);
+    describe("after");
+}
+
+/// A series of scans of the whole rig in real time: how long from one capture to the next, while the one before is computed.
+#[test]
+fn figures_of_a_series() {
+    describe("before");
+    let daemon = Daemon::on(Rig::scaled(1.0).set("sim.pacing", "real-time")).started();
+    daemon.ready();
+    daemon.finished_scan();
+    let mut events = Events::follow(daemon.address(), None);
+    let memory = |key: &str| status_kib(daemon.process(), key);
+    let idle_kib = memory("VmRSS");
+    let asked = daemon.post("/v1/scans", &json!({ "mode": "pse", "repeat": PAIRS })).expect(202).json();
+    let ids: Vec<&str> = asked["scans"].as_array().expect("scans").iter().filter_map(Value::as_str).collect();
+    let (mut acquired, mut after) = (Vec::new(), Vec::new());
+    while after.len() < ids.len() {
+        let event = events.next();
+        let Some(place) = ids.iter().position(|id| event.data["id"] == *id) else { continue };
+        match event.data["state"].as_str() {
+            Some("acquired") => acquired.push(Instant::now()),
+            Some("done") => after.push(ms(acquired[place].elapsed())),
+            Some("failed") => panic!("{}", event.data),
+            _ => {}
+        }
+    }
+    let rehearsed_ms: HashMap<String, f64> =
+        first_patterns(&daemon).map(|one| (one.scan, one.rehearsed_ms)).collect();
+    let between = acquired.windows(2).map(|two| ms(two[1] - two[0]));
+    let own = between.zip(&ids[1..]).map(|(between, id)| {
+        let report = daemon.get(&format!("/v1/scans/{id}/report.json")).expect(200).json();
+        between - rehearsed_ms[*id] - 1e3 * report["capture"]["seconds"].as_f64().expect("a time")
+    });
+    say(
+        "from the last frame of a scan to the first pattern of the next, without what the simulated rig renders in advance",
+        own.collect(),
+    );
+    say("from the last frame until the result is on the disk, with that", after);
+    println!("resident memory: {idle_kib} KiB before, {} KiB at most", memory("VmHWM"));
     describe("after");
 }
 
