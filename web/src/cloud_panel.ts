@@ -3,6 +3,7 @@
 import { bytes } from "./api";
 import type { CloudView, Colouring } from "./cloud";
 import { choice, count, field, h, say } from "./dom";
+import { steer } from "./keys";
 import { COLOURINGS, showLegend } from "./legend";
 import { readPly, type Cloud } from "./ply";
 import { distance, fitLine, section, type Point, type Profile, type Line } from "./section";
@@ -109,22 +110,7 @@ export function cloudPanel(href: string): [HTMLElement, () => void] {
     if (pressed && Math.hypot(event.offsetX - pressed[0], event.offsetY - pressed[1]) < 4) take(event.offsetX, event.offsetY);
     pressed = null;
   });
-  canvas.addEventListener("keydown", (event) => {
-    const acts: Record<string, () => void> = {
-      ArrowLeft: () => view?.turn(-3, 0),
-      ArrowRight: () => view?.turn(3, 0),
-      ArrowUp: () => view?.turn(0, -3),
-      ArrowDown: () => view?.turn(0, 3),
-      "+": () => view?.zoom(0.9),
-      "-": () => view?.zoom(1.1),
-      r: () => view?.reset(),
-      Enter: () => take(canvas.clientWidth / 2, canvas.clientHeight / 2),
-    };
-    const act = acts[event.key];
-    if (!act || event.ctrlKey || event.metaKey || event.altKey) return;
-    event.preventDefault();
-    act();
-  });
+  steer(canvas, () => view, { Enter: () => take(canvas.clientWidth / 2, canvas.clientHeight / 2) });
 
   async function load(): Promise<void> {
     const [data, code] = await Promise.all([bytes(href), import("./cloud")]);

@@ -4,6 +4,7 @@ import { bytes, get, type Scan } from "./api";
 import type { CloudView, Colouring } from "./cloud";
 import { badge, choice, count, field, h, moment } from "./dom";
 import { listen } from "./events";
+import { steer } from "./keys";
 import { COLOURINGS, showLegend } from "./legend";
 import { readPly } from "./ply";
 import { isOver, outcome } from "./words";
@@ -87,21 +88,7 @@ export function livePanel(): { box: HTMLElement; follow: () => void; end: () => 
     if (wanted) void pump();
     else latest().catch(() => undefined);
   });
-  canvas.addEventListener("keydown", (event) => {
-    const acts: Record<string, () => void> = {
-      ArrowLeft: () => view?.turn(-3, 0),
-      ArrowRight: () => view?.turn(3, 0),
-      ArrowUp: () => view?.turn(0, -3),
-      ArrowDown: () => view?.turn(0, 3),
-      "+": () => view?.zoom(0.9),
-      "-": () => view?.zoom(1.1),
-      r: () => view?.reset(),
-    };
-    const act = acts[event.key];
-    if (!act || event.ctrlKey || event.metaKey || event.altKey) return;
-    event.preventDefault();
-    act();
-  });
+  steer(canvas, () => view);
   const forget = listen((kind, data: Scan) => {
     if (kind === "scan" && isOver(data)) take(data);
   });

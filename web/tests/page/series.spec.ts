@@ -28,12 +28,8 @@ test("clouds of a series are shown as they come, seen from where the operator lo
 
   // A scan that somebody else asks for is looked at as well, from the same side.
   const picture = () => page.locator("#live-cloud").evaluate((canvas: HTMLCanvasElement) => canvas.toDataURL());
-  const covered = async () => {
-    const before = await picture();
-    await page.locator("#live-cloud").press("r");
-    return before;
-  };
-  const turned = await covered();
+  const turned = await picture();
+  await page.locator("#live-cloud").press("r");
   await expect.poll(picture).not.toBe(turned);
   const other = await daemon.scan({ label: "a script's" });
   await expect(live).toHaveAttribute("data-shown", other.id);
@@ -50,7 +46,7 @@ test("clouds of a series are shown as they come, seen from where the operator lo
   await expect.poll(() => asked.length).toBe(before + 1);
 });
 
-test.describe("where the room is lit within scans", () => {
+test.describe("at the pace of a real rig", () => {
   test.use({ rig: { set: ['sim.pacing="real-time"'] } });
 
   test("a series is ended, and a scan without a cloud is told", async ({ page, daemon }) => {
