@@ -38,12 +38,13 @@ pub(super) fn take(settings: &Settings, regions: &[NamedRegion], out: &Path) -> 
     };
     let taken = scan.capture(&mut rig, &mut progress, &cancel);
     bar.say("decoding");
-    let report = scan.finish(&taken, Label { id: new_id(), ..Label::default() }, writer)?;
+    let report = scan.finish(&taken, Label { id: new_id(), ..Label::default() }, writer, &cancel)?;
     drop(bar);
     Ok(report)
 }
 
-/// An interrupt from the terminal cancels the capture, which leaves the projector black. A second one ends the program.
+/// An interrupt from the terminal cancels the capture, which leaves the projector black, or what is made of its frames,
+/// which are kept. A second one ends the program.
 pub(super) fn cancel_on_interrupt(cancel: &CancelFlag) {
     let cancel = cancel.clone();
     let installed = ctrlc::set_handler(move || {

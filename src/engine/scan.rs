@@ -247,15 +247,30 @@ impl Scan {
         }
     }
 
-    /// Decodes what was taken and writes everything; where that cannot be, keeps the frames with a report that says why.
+    /// Decodes what was taken and writes everything; where that cannot be, or `cancel` asks to stop before it is written,
+    /// keeps the frames with a report that says why.
     ///
     /// # Errors
     /// Only storage: whatever is wrong with the frames is a verdict of the report.
-    pub fn finish(&self, taken: &Taken, label: Label, writer: BundleWriter) -> Result<Report, Failure> {
+    pub fn finish(
+        &self,
+        taken: &Taken,
+        label: Label,
+        writer: BundleWriter,
+        cancel: &CancelFlag,
+    ) -> Result<Report, Failure> {
+        let given_up = || {
+            let message =
+                "it was cancelled after the frames had come; decode them if they are wanted after all";
+            Reason::failed(Diagnosis::Cancelled, message, serde_json::Value::Null)
+        };
         let mut manifest = self.manifest(label);
         manifest.record_capture(&taken.record, self.settings.camera.clone());
         if let Some(reason) = &taken.failure {
             return self.keep(taken, reason.clone(), manifest, writer);
+        }
+        if cancel.is_cancelled() {
+            return self.keep(taken, given_up(), manifest, writer);
         }
         let frames = TakenFrames::new(taken);
         let job = self.job(&frames);
@@ -267,6 +282,9 @@ impl Scan {
                 return self.keep(taken, reason, manifest, writer);
             }
         };
+        if cancel.is_cancelled() {
+            return self.keep(taken, given_up(), manifest, writer);
+        }
         let context = frames.context(self, taken);
         let results = Results {
             job: &job,
@@ -330,7 +348,8 @@ impl Scan {
         let record = &taken.record;
         manifest.sequence = record.frames.iter().map(|captured| captured.role).collect();
         if let Some(capture) = &mut manifest.capture {
-            capture.failure = Some(reason.clone());
+            // What became of a complete capture is no fault of its frames, which may be decoded again.
+            capture.failure.clone_from(&taken.failure);
         }
         let planes: Vec<SharedPlane> =
             record.frames.iter().map(|captured| shared_plane(&captured.frame)).collect();

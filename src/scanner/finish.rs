@@ -1,5 +1,5 @@
-//! The thread that finishes captures: decodes and writes them, one after the other, on a pool of threads of its own, so
-//! that the interface answers while all cores compute.
+//! The threads that compute: one finishes captures, decodes and writes them, one after the other; one solves calibrations.
+//! They share a pool that stands back behind all others, so that the interface answers while all cores compute.
 
 use std::{
     panic::{AssertUnwindSafe, catch_unwind},
@@ -38,12 +38,12 @@ pub enum Work {
         mode: Option<Mode>,
         /// Where the result goes.
         bundle: PathBuf,
+        /// Asks not to begin.
+        cancel: CancelFlag,
     },
-    /// A step of a calibration that needs no rig.
-    Step(Box<Step>),
 }
 
-/// A step of a session with a board.
+/// A step of a session with a board, which needs no rig.
 #[derive(Debug)]
 pub struct Step {
     /// Identity of the calibration.
@@ -108,17 +108,19 @@ pub fn pool() -> Result<rayon::ThreadPool, rayon::ThreadPoolBuildError> {
         .build()
 }
 
-/// Runs until all senders of `work` are gone.
+/// Finishes captures until all senders of `work` are gone.
 pub fn run(pool: &rayon::ThreadPool, news: &Sender<Message>, work: &Receiver<Work>) {
     let tell = |said| drop(news.send(Message::Finish(said)));
     for work in work {
         match work {
             Work::Capture(captured) => {
-                let Captured { scan, taken, writer, label } = *captured;
+                let Captured { scan, taken, writer, label, cancel } = *captured;
                 let id = label.id.clone();
-                finish(pool, &tell, id, || scan.finish(&taken, label, writer));
+                finish(pool, &tell, id, || scan.finish(&taken, label, writer, &cancel));
             }
-            Work::Recorded { label, source, mode, bundle } => {
+            // Its frames are another's: nothing is lost, and whoever cancelled it has had the answer.
+            Work::Recorded { cancel, .. } if cancel.is_cancelled() => {}
+            Work::Recorded { label, source, mode, bundle, cancel: _ } => {
                 let recorded = DecodeRequest {
                     bundle: &source,
                     calibration: None,
@@ -130,8 +132,15 @@ pub fn run(pool: &rayon::ThreadPool, news: &Sender<Message>, work: &Receiver<Wor
                 let id = label.id.clone();
                 finish(pool, &tell, id, || engine::decode(&recorded, label, &bundle));
             }
-            Work::Step(step) => take_step(pool, &tell, &step),
         }
+    }
+}
+
+/// Carries out steps of calibrations until all senders are gone; on a thread of its own, so that they hold up no result.
+pub fn run_steps(pool: &rayon::ThreadPool, news: &Sender<Message>, steps: &Receiver<Step>) {
+    let tell = |said| drop(news.send(Message::Finish(said)));
+    for step in steps {
+        take_step(pool, &tell, &step);
     }
 }
 

@@ -92,6 +92,8 @@ pub struct Captured {
     pub writer: BundleWriter,
     /// How it is called.
     pub label: Label,
+    /// Asks to keep the frames alone.
+    pub cancel: CancelFlag,
 }
 
 /// What the rig tells.
@@ -437,6 +439,6 @@ impl Open {
         let taken = scan.capture(&mut self.rig, &mut progress, &job.cancel);
         self.tell_projector(shared);
         shared.metrics.stream(&self.rig.camera.info().serial, taken.statistics());
-        Ok(Captured { scan, taken, writer, label: job.label })
+        Ok(Captured { scan, taken, writer, label: job.label, cancel: job.cancel })
     }
 }

@@ -63,6 +63,7 @@ pub fn start(settings: Settings, library: Library, index: Index) -> std::io::Res
     let (messages, inbox) = channel();
     let (rig_sender, rig_commands) = channel();
     let (finish_sender, work) = channel();
+    let (step_sender, steps) = channel();
     let (disk_sender, disk_thread) = disk::start()?;
     let (snapshot_sender, snapshot) = watch::channel(Arc::new(Snapshot::default()));
     let next = next_event(&index);
@@ -75,7 +76,7 @@ pub fn start(settings: Settings, library: Library, index: Index) -> std::io::Res
         metrics: Arc::new(Metrics::default()),
         heartbeats: [Arc::new(Heartbeat::default()), Arc::new(Heartbeat::default())],
     };
-    let pool = finish::pool().map_err(std::io::Error::other)?;
+    let pool = Arc::new(finish::pool().map_err(std::io::Error::other)?);
     let shared = rig::Shared {
         settings: settings.clone(),
         news: messages.clone(),
@@ -87,6 +88,7 @@ pub fn start(settings: Settings, library: Library, index: Index) -> std::io::Res
     let outlets = Outlets {
         rig: rig_sender,
         finish: finish_sender,
+        steps: step_sender,
         disk: disk_sender,
         snapshot: snapshot_sender,
         events: scanner.events.clone(),
@@ -95,11 +97,13 @@ pub fn start(settings: Settings, library: Library, index: Index) -> std::io::Res
         rig_heartbeat: scanner.heartbeats[1].clone(),
     };
     let owner = Owner::new(settings, library, index, outlets);
+    let (step_pool, step_news) = (pool.clone(), messages.clone());
     let spawn = |name: &str, run: Box<dyn FnOnce() + Send>| Builder::new().name(name.to_owned()).spawn(run);
     let threads = vec![
         spawn("owner", Box::new(move || owner.run(&inbox)))?,
         spawn("rig", Box::new(move || rig::run(&shared, &rig_commands)))?,
         spawn("finish", Box::new(move || finish::run(&pool, &messages, &work)))?,
+        spawn("steps", Box::new(move || finish::run_steps(&step_pool, &step_news, &steps)))?,
         disk_thread,
     ];
     Ok((scanner, Threads(threads)))

@@ -9,7 +9,7 @@ use std::{
 use rusqlite::{Connection, OpenFlags, OptionalExtension, Row, params, types::Value};
 use thiserror::Error;
 
-use crate::scanner::{Record, State};
+use crate::scanner::{MOST_REPEATS, Record, State};
 
 /// Name of the index in its store.
 pub const FILE_NAME: &str = "index.sqlite";
@@ -243,6 +243,14 @@ impl Index {
     /// One scan.
     pub fn get(&self, id: &str) -> Result<Option<Record>> {
         Ok(self.records("read a scan", "SELECT record FROM scans WHERE id = ?1", [id])?.pop())
+    }
+
+    /// Identities of the scans that were asked for at once with the scan `first`, in their order, without those that were
+    /// deleted since. Identities grow, and nobody else's lie between those of one request.
+    pub fn series(&self, first: &str) -> Result<Vec<String>> {
+        let sql = "SELECT id FROM (SELECT id, record FROM scans WHERE id >= ?1 ORDER BY id LIMIT ?2)
+                   WHERE json_extract(record, '$.series.first') = ?1 ORDER BY id";
+        self.rows("look for a series", sql, params![first, MOST_REPEATS as i64], |row| row.get(0))
     }
 
     /// Forgets a scan.

@@ -3,6 +3,7 @@
 mod calibrations;
 mod client;
 mod daemon;
+mod endings;
 mod exports;
 mod kills;
 mod lifecycle;

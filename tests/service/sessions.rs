@@ -252,6 +252,26 @@ fn solving_and_dropping_need_no_rig() {
 }
 
 #[test]
+fn a_view_that_cannot_be_read_is_named_and_can_be_dropped() {
+    let daemon = Daemon::on(Rig::small()).started();
+    daemon.ready();
+    let id = open(&daemon);
+    view(&daemon, &id);
+    view(&daemon, &id);
+    let folder = daemon.rig.path(&format!("store/.calibrations/{id}.session"));
+    std::fs::remove_file(folder.join("view-01.json")).expect("what was seen in it");
+    std::fs::write(folder.join("view-01/frames.npy"), "no frames").expect("a spoilt file");
+    let session = step(&daemon, &id, "solve");
+    let views = session["session"]["views"].as_array().expect("views").clone();
+    assert_eq!((&session["state"], names(&session).len()), (&json!("open"), 2), "{session}");
+    assert!(views[0]["unusable"].as_str().is_some_and(|why| why.contains("view-01")), "{session}");
+    assert_eq!(views[1]["unusable"], Value::Null);
+    drop_view(&daemon, &id, "view-01").expect(202);
+    let session = settled(&daemon, &id);
+    assert_eq!((&session["error"], names(&session)), (&Value::Null, vec!["view-02".to_owned()]));
+}
+
+#[test]
 fn a_solve_that_is_cut_short_leaves_all_or_nothing() {
     let mut daemon = Daemon::on(Rig::small()).started();
     daemon.ready();

@@ -91,7 +91,7 @@ pub(super) fn widest_angle(boards: &[Pose]) -> f64 {
 }
 
 /// What a session still needs.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub struct Guidance {
     /// Which parts are filled.
     pub coverage: Coverage,

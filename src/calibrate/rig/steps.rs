@@ -12,7 +12,7 @@ use super::{
     session::Session,
     solve::{Subject, setup, solve},
     take::{Shot, alive, take},
-    views::{Views, number_of},
+    views::{Unusable, Views, number_of},
 };
 use crate::{
     app::{Rig, holding},
@@ -113,7 +113,7 @@ pub fn run(
     }
     let folder = &task.folder;
     let mut session = Session::read(folder)?;
-    let mut views = alive(cancel, || Views::recall(folder, &session))?;
+    let mut views = alive(cancel, || Views::recall(folder, &session, cancel))?;
     let name = next_name(folder, &session)?;
     doing(&format!("taking {name}"));
     let one = add(&name, &session, folder, rig, settings, cancel, doing)?;
@@ -128,7 +128,7 @@ pub fn run(
     Ok(Outcome { session: Some(SessionState::of(&session, &views)?), ..Outcome::default() })
 }
 
-/// Carries out a step that needs no rig, as [`run`] does.
+/// Carries out a step that needs no rig, as [`run`] does, on the threads of whoever calls.
 ///
 /// # Errors
 /// A view that is not there or cannot be read, the disk, or `cancel`.
@@ -144,13 +144,16 @@ pub fn compute(
         // First of all, since it may be the view that cannot be read.
         session.views.retain(|view| view != name);
         session.write(folder)?;
-        remove(folder, name)?;
+        // The session is without it from here on, whatever becomes of its files.
+        if let Err(failure) = remove(folder, name) {
+            tracing::warn!(error = failure.chain(), "a dropped view still takes space");
+        }
     }
-    let views = alive(cancel, || Views::recall(folder, &session))?;
+    let views = Views::recall(folder, &session, cancel)?;
     let mut outcome = Outcome::default();
     if *step == Step::Solve {
         doing("solving");
-        outcome = alive(cancel, || solution(&session, &views, out))?;
+        outcome = solution(&session, &views, out)?;
     }
     outcome.session = Some(SessionState::of(&session, &views)?);
     Ok(outcome)
@@ -225,13 +228,18 @@ impl SessionState {
     /// A session as it stands with these views.
     ///
     /// # Errors
-    /// None with views; without any there are no sizes to judge by.
+    /// None: where no view can be read, there are no sizes to judge by, and all is missing.
     fn of(session: &Session, views: &Views) -> Result<Self, Failure> {
         let empty = Self::empty(session);
-        if views.camera.is_none() {
-            return Ok(empty);
-        }
-        let found = guidance(&views.views, &setup(views, session.gates, session.baseline_mm)?, None);
+        let setup = views.camera.map(|_| setup(views, session.gates, session.baseline_mm)).transpose()?;
+        let found = match setup {
+            Some(setup) => guidance(&views.views, &setup, None),
+            None => Guidance {
+                views_missing: empty.views_missing,
+                missing: empty.missing.clone(),
+                ..Guidance::default()
+            },
+        };
         let Guidance { coverage, tilts_deg, views_missing, missing } = found;
         let view = |name: &String| {
             let usable = views.views.iter().position(|view| view.name == *name);
@@ -241,7 +249,7 @@ impl SessionState {
                 name: name.clone(),
                 unusable: unusable.map(|view| view.reason.clone()),
                 corners: seen.map_or(0, |seen| seen.corners),
-                corner_sigma_px: seen.map(|seen| seen.corner_sigma_px).filter(|sigma| sigma.is_finite()),
+                corner_sigma_px: seen.and_then(|seen| seen.corner_sigma_px),
                 plane_points: seen.map_or(0, |seen| seen.plane_points),
                 tilt_deg: usable.and_then(|at| tilts_deg.get(at).copied().flatten()),
             }
@@ -267,20 +275,25 @@ impl SessionState {
 }
 
 impl Views {
-    /// Everything that was seen in the views of a session.
+    /// Everything that was seen in the views of a session. A view whose frames are not there, or cannot be decoded, is
+    /// of no use, with the reason.
     ///
     /// # Errors
-    /// A view is not there, or its frames cannot be decoded.
-    fn recall(folder: &Path, session: &Session) -> Result<Self, Failure> {
+    /// `cancel`.
+    fn recall(folder: &Path, session: &Session, cancel: &CancelFlag) -> Result<Self, Failure> {
         let mut all = Self::default();
         for name in &session.views {
+            if cancel.is_cancelled() {
+                return Err(Failure::data("look into the views", "it was cancelled"));
+            }
             let written = fs::read(Self::file(folder, name)).ok();
-            match written.and_then(|json| serde_json::from_slice::<Self>(&json).ok()) {
-                Some(one) => all.join(&one)?,
+            let added = match written.and_then(|json| serde_json::from_slice::<Self>(&json).ok()) {
+                Some(one) => all.join(&one),
                 // The frames are the truth.
-                None => {
-                    all.add_bundle(name, &folder.join(name), &session.board, DetectSettings::default())?;
-                }
+                None => all.add_bundle(name, &folder.join(name), &session.board, DetectSettings::default()),
+            };
+            if let Err(failure) = added {
+                all.unusable.push(Unusable { name: name.clone(), reason: failure.chain() });
             }
         }
         Ok(all)

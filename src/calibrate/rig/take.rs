@@ -71,11 +71,15 @@ pub fn take(
     };
     alive(cancel, || {
         scan.examine(&taken, look).map_err(failed)??;
+        if cancel.is_cancelled() {
+            return Err(Failure::data(format!("take the view {name}"), "it was cancelled"));
+        }
         let Some(folder) = shot.keep else { return Ok(()) };
         let failed = |error| Failure::storage(format!("keep the view {name}"), error);
         let writer = BundleWriter::create(&folder.join(name), None, scan.bytes()).map_err(failed)?;
         let label = Label { id: new_id(), label: Some(name.into()), ..Label::default() };
-        scan.finish(&taken, label, writer).map(drop)
+        // A view is kept as a whole or not at all.
+        scan.finish(&taken, label, writer, &CancelFlag::default()).map(drop)
     })
 }
 

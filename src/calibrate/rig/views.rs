@@ -35,8 +35,8 @@ pub struct Seen {
     pub name: String,
     /// Corners found.
     pub corners: usize,
-    /// Their standard deviation by the picture's noise, rms, in px.
-    pub corner_sigma_px: f64,
+    /// Their standard deviation by the picture's noise, rms, in px, where the noise tells one.
+    pub corner_sigma_px: Option<f64>,
     /// Median width of the board's edges in px.
     pub edge_width_px: Option<f64>,
     /// Plane points found.
@@ -89,7 +89,8 @@ impl Views {
                 self.seen.push(Seen {
                     name: name.into(),
                     corners: corners.len(),
-                    corner_sigma_px: (sigma_sq / corners.len() as f64).sqrt(),
+                    corner_sigma_px: Some((sigma_sq / corners.len() as f64).sqrt())
+                        .filter(|px| px.is_finite()),
                     edge_width_px: Some(found.edge_width_px).filter(|width| width.is_finite()),
                     plane_points: plane_points.len(),
                 });

@@ -94,7 +94,7 @@ impl Owner {
         match task {
             Task::Rig(task) if !task.needs_rig() => {
                 let step = finish::Step { id: id.clone(), task, cancel, folder };
-                let _ = self.out.finish.send(Work::Step(Box::new(step)));
+                let _ = self.out.steps.send(step);
                 self.stepping = Some(one);
             }
             task => {

@@ -84,6 +84,8 @@ pub struct Outlets {
     pub rig: Sender<rig::Command>,
     /// To the finisher.
     pub finish: Sender<Work>,
+    /// To whoever carries out steps of calibrations.
+    pub steps: Sender<finish::Step>,
     /// To the disk.
     pub disk: Sender<disk::Task>,
     /// The snapshot.
@@ -201,7 +203,9 @@ impl Owner {
             }
             if self.stopping {
                 if self.stop_by.is_some_and(|limit| Instant::now() >= limit) {
-                    self.cancel.values().for_each(CancelFlag::cancel);
+                    // Whoever has all frames is left to end: a stop must not cost what was captured.
+                    let capturing = self.active.as_ref().and_then(|id| self.cancel.get(id));
+                    capturing.into_iter().for_each(CancelFlag::cancel);
                 }
                 let calibrates = self.calibrating.is_some() || self.stepping.is_some();
                 if self.active.is_none() && self.finishing.is_empty() && !calibrates {

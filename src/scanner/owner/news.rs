@@ -2,6 +2,9 @@
 
 use super::*;
 
+/// Slug and message of a scan that somebody asked to stop.
+pub(super) const CANCELLED: (&str, &str) = ("cancelled", "the scan was cancelled");
+
 impl Owner {
     /// The answer is for whoever asked the rig through the owner.
     pub(super) fn rig_news(&mut self, news: rig::News) -> Option<Answer> {
@@ -127,24 +130,24 @@ impl Owner {
 
     pub(super) fn finished(&mut self, id: &str, result: Result<Box<Report>, Broken>) {
         self.finishing.retain(|other| other != id);
-        let cancelled = self.cancel.get(id).is_some_and(CancelFlag::is_cancelled);
         let cut_short = self.cut_short.remove(id);
-        match result {
-            // The frames were complete and somebody asked to stop all the same: nobody wants the result.
-            Ok(_) if cancelled && cut_short.is_none() => {
-                match self.library.discard(id) {
-                    Ok(left) => {
-                        left.into_iter().for_each(|left| drop(self.out.disk.send(disk::Task::Remove(left))))
-                    }
-                    Err(error) => {
-                        tracing::warn!(id, error = chain(&error), "a cancelled scan still takes space")
-                    }
-                }
-                self.end(id, State::Cancelled, |record| record.blame("cancelled", "the scan was cancelled"));
+        let Some(record) = self.scans.get(id) else { return };
+        let (ended, decoded_again) = (record.state.is_terminal(), record.source.is_some());
+        let cancelled = cut_short.is_none() && self.cancel.get(id).is_some_and(CancelFlag::is_cancelled);
+        // A result that nobody wants any more; the frames are another's.
+        if ended || cancelled && decoded_again {
+            self.forget_bundle(id);
+            if !ended {
+                self.end(id, State::Cancelled, |record| record.blame(CANCELLED.0, CANCELLED.1));
             }
+            return self.look_at_storage();
+        }
+        match result {
             Ok(report) => {
                 let state = match cut_short {
                     Some(diagnosis) => self.end_of(diagnosis).0,
+                    // Frames are kept in any case, and so is a result that was already being written.
+                    None if cancelled => State::Cancelled,
                     None if report.verdict == Verdict::Failed => State::Failed,
                     None => State::Done,
                 };
@@ -152,11 +155,22 @@ impl Owner {
                 self.end(id, state, |record| {
                     record.adopt(&report);
                     record.bytes = bytes;
+                    if cancelled && record.error.is_none() {
+                        record.blame(CANCELLED.0, CANCELLED.1);
+                    }
                 });
             }
             Err(broken) => self.end(id, State::Failed, |record| record.blame(broken.kind, broken.message)),
         }
         self.look_at_storage();
+    }
+
+    /// Takes away what was written of a scan that was given up.
+    fn forget_bundle(&mut self, id: &str) {
+        match self.library.discard(id) {
+            Ok(left) => left.into_iter().for_each(|left| drop(self.out.disk.send(disk::Task::Remove(left)))),
+            Err(error) => tracing::warn!(id, error = chain(&error), "a cancelled scan still takes space"),
+        }
     }
 
     /// The rig is free again.

@@ -1,6 +1,6 @@
 //! What clients ask for.
 
-use super::*;
+use super::{news::CANCELLED, *};
 
 impl Owner {
     pub(super) fn submit(&mut self, submit: &Submit) -> Result<(Vec<Arc<Record>>, bool), Denied> {
@@ -54,13 +54,21 @@ impl Owner {
         if used.body != body {
             return Err(Denied::KeyReused);
         }
-        let record = match self.scans.get(&used.scan) {
-            Some(record) => Some(record.clone()),
-            None => self.index.get(&used.scan).map_err(|error| Denied::Storage(chain(&error)))?.map(Arc::new),
+        let first = match self.find(&used.scan) {
+            Ok(record) => record,
+            // A scan that was deleted since is still the answer: the request must not run twice.
+            Err(Denied::Unknown) => {
+                let mut gone = Record::new(used.scan.clone(), self.settings.mode.to_string(), now());
+                gone.advance(State::Cancelled, now());
+                gone.blame("deleted", "the scan was deleted since it was asked for");
+                Arc::new(gone)
+            }
+            Err(denied) => return Err(denied),
         };
-        // A scan that was deleted since is still the answer: the request must not run twice.
-        let record = record.unwrap_or_else(|| Arc::new(Record::new(used.scan.clone(), String::new(), now())));
-        Ok((vec![record], true))
+        let later = self.index.series(&used.scan).map_err(|error| Denied::Storage(chain(&error)))?;
+        let later = later.into_iter().filter(|id| *id != used.scan).map(|id| self.find(&id));
+        let records = std::iter::once(Ok(first)).chain(later).collect::<Result<_, _>>()?;
+        Ok((records, true))
     }
 
     pub(super) fn records(&self, submit: &Submit, source: Option<&str>) -> Vec<Record> {
@@ -178,9 +186,10 @@ impl Owner {
         let Some(record) = self.scans.get(id) else { return };
         let label = Label { id: id.to_owned(), label: record.label.clone(), tags: record.tags.clone() };
         let (source, bundle) = (self.library.bundle(source), self.library.bundle(id));
-        self.cancel.insert(id.to_owned(), CancelFlag::default());
+        let cancel = CancelFlag::default();
+        self.cancel.insert(id.to_owned(), cancel.clone());
         self.finishing.push_back(id.to_owned());
-        let _ = self.out.finish.send(Work::Recorded { label, source, mode, bundle });
+        let _ = self.out.finish.send(Work::Recorded { label, source, mode, bundle, cancel });
     }
 
     pub(super) fn cancel(&mut self, id: &str) -> Result<Arc<Record>, Denied> {
@@ -204,13 +213,23 @@ impl Owner {
             .collect();
         for id in &later {
             self.queue.retain(|waiting| waiting.id != *id);
-            self.end(id, State::Cancelled, |record| record.blame("cancelled", "the scan was cancelled"));
+            self.end(id, State::Cancelled, |record| record.blame(CANCELLED.0, CANCELLED.1));
         }
         if let Some(flag) = self.cancel.get(id) {
             flag.cancel();
         }
+        if self.waits_to_be_decoded(id) {
+            self.finishing.retain(|other| other != id);
+            self.end(id, State::Cancelled, |record| record.blame(CANCELLED.0, CANCELLED.1));
+        }
         self.number_queue();
         self.find(id)
+    }
+
+    /// Whether recorded frames have not begun to be decoded.
+    fn waits_to_be_decoded(&self, id: &str) -> bool {
+        let state = self.scans.get(id).map(|record| record.state);
+        state == Some(State::Queued) && self.finishing.iter().any(|other| other == id)
     }
 
     pub(super) fn delete(&mut self, id: &str) -> Result<(), Denied> {
@@ -302,6 +321,14 @@ impl Owner {
         // A measurement has nothing that could be kept, and can be asked for again.
         self.calibrating.iter().chain(&self.stepping).for_each(|one| one.cancel.cancel());
         // Decodes that have not begun can be asked for again; queued scans stay queued.
+        let waiting: Vec<String> =
+            self.finishing.iter().filter(|id| self.waits_to_be_decoded(id)).cloned().collect();
+        self.finishing.retain(|id| !waiting.contains(id));
+        for id in &waiting {
+            self.cancel.get(id).into_iter().for_each(CancelFlag::cancel);
+            let message = "the service ended before the frames were decoded; ask for it again";
+            self.end(id, State::Interrupted, |record| record.blame(Diagnosis::Interrupted.slug(), message));
+        }
         tracing::info!(grace_s = grace.as_secs_f64(), "stopping");
     }
 }
