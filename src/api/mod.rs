@@ -215,7 +215,11 @@ async fn guard(State(app): State<App>, request: Request, next: Next) -> Response
     let is_probe = matches!(path.as_str(), "/livez" | "/readyz");
     let checked = app.gate.check(request.method(), request.uri(), request.headers());
     let waits = request.method() == Method::GET && (path == "/v1/events" || path == "/v1/preview.mjpeg")
-        || request.uri().query().is_some_and(|query| query.contains("wait="));
+        || matches!(path.as_str(), "/v1/scans" | "/v1/scans/{id}" | "/v1/scans/{id}/reprocess")
+            && request
+                .uri()
+                .query()
+                .is_some_and(|query| query.split('&').any(|pair| pair.starts_with("wait=")));
     let (request, rest) = linger::Rest::of(request);
     // Those that stay have places of their own; probes are always answered.
     let place = (!waits && !is_probe).then(|| app.requests.clone().try_acquire_owned());

@@ -184,7 +184,7 @@ impl From<Denied> for Problem {
                 let kind = kind.name();
                 Kind::Busy
                     .with(format!(
-                        "calibration {} ({kind}) has the rig; wait for it, or cancel it",
+                        "calibration {} ({kind}) is under way; wait for it, or cancel it",
                         holder.id
                     ))
                     .and("holder", json!(holder))

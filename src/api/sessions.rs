@@ -15,7 +15,7 @@ use super::{
     scans::{Empty, invalid},
 };
 use crate::{
-    calibrate::rig::Step,
+    calibrate::rig::{MOST_VIEWS, Step},
     calibration::{boards::Board, rig::Gates},
     scanner::{SessionAsk, is_id},
 };
@@ -67,7 +67,12 @@ pub async fn post_rig(Shared(app): Shared<App>, Body(asked): Body<RigRequest>) -
     if baseline_mm.is_some_and(|baseline| !BASELINE_MM.contains(&baseline)) {
         return Err(invalid("baseline_mm", "0.1 to 100 000"));
     }
-    let ask = SessionAsk { board, gates: gates.unwrap_or_default(), baseline_mm };
+    let gates = gates.unwrap_or_default();
+    let faults = gates.faults(MOST_VIEWS);
+    if !faults.is_empty() {
+        return Err(invalid("gates", faults.join("; ")));
+    }
+    let ask = SessionAsk { board, gates, baseline_mm };
     let record = app.scanner.open_session(ask).await?;
     Ok(CalibrationRun::new(&record).accepted())
 }

@@ -12,6 +12,9 @@ use crate::scanner::{CalibrationRecord, CalibrationState, is_id};
 /// Folder within a store.
 const FOLDER: &str = ".calibrations";
 
+/// Folder within it of what is being deleted.
+const TRASH: &str = ".trash";
+
 /// Calibrations of a store.
 #[derive(Debug, Clone)]
 pub struct Calibrations(PathBuf);
@@ -43,22 +46,31 @@ impl Calibrations {
         self.0.join(format!("{id}.session"))
     }
 
-    /// Removes a calibration with all its files. What is known of it goes first: without it the rest is nothing.
+    /// Takes a calibration away with all its files, at once and as a whole. What is known of it goes first: without it the
+    /// rest is nothing. What is returned still takes space, and is to be removed.
     ///
     /// # Errors
     /// The disk says no.
-    pub fn remove(&self, id: &str) -> Result<(), StorageError> {
-        let gone = |result: io::Result<()>, path: &Path| match result {
-            Err(error) if error.kind() != io::ErrorKind::NotFound => {
-                Err(StorageError::file("remove", path, error))
-            }
-            _ => Ok(()),
-        };
+    pub fn discard(&self, id: &str) -> Result<Vec<PathBuf>, StorageError> {
         let record = self.0.join(format!("{id}.json"));
-        gone(fs::remove_file(&record), &record)?;
-        [self.files(id), self.views(id)]
-            .iter()
-            .try_for_each(|folder| gone(fs::remove_dir_all(folder), folder))
+        match fs::remove_file(&record) {
+            Err(error) if error.kind() != io::ErrorKind::NotFound => {
+                return Err(StorageError::file("remove", &record, error));
+            }
+            _ => {}
+        }
+        let trash = self.0.join(TRASH);
+        fs::create_dir_all(&trash).map_err(|error| StorageError::file("create folder", &trash, error))?;
+        let mut left = Vec::new();
+        for folder in [self.files(id), self.views(id)] {
+            let aside = folder.file_name().map(|name| trash.join(name)).unwrap_or_else(|| trash.join(id));
+            match fs::rename(&folder, &aside) {
+                Ok(()) => left.push(aside),
+                Err(error) if error.kind() == io::ErrorKind::NotFound => {}
+                Err(error) => return Err(StorageError::file("remove", &folder, error)),
+            }
+        }
+        Ok(left)
     }
 
     /// Writes what is known of a calibration. All or nothing.
@@ -92,6 +104,12 @@ impl Calibrations {
         };
         if let Err(error) = bundle::remove_stale_partials(&self.0) {
             tracing::warn!(%error, "what a calibration left still takes space");
+        }
+        let trash = self.0.join(TRASH);
+        if trash.exists()
+            && let Err(error) = fs::remove_dir_all(&trash)
+        {
+            tracing::warn!(%error, "deleted calibrations still take space");
         }
         let mut records = Vec::new();
         for entry in entries {
@@ -172,6 +190,11 @@ mod tests {
         assert_eq!((first.state, first.finished.as_deref()), (CalibrationState::Interrupted, Some("now")));
         assert_eq!(second, &ended);
         assert_eq!((store.files("a").exists(), store.files("b").exists()), (true, true));
-        assert_eq!(store.recover("later").unwrap().iter().find(|one| one.id == "a"), Some(first));
+        fs::create_dir(store.views("b")).unwrap();
+        let left = store.discard("b").unwrap();
+        assert_eq!((left.len(), left.iter().all(|left| left.is_dir())), (2, true), "{left:?}");
+        assert!(store.discard("b").unwrap().is_empty());
+        assert_eq!(store.recover("later").unwrap(), std::slice::from_ref(first));
+        assert!(!left.iter().any(|left| left.exists()), "a start removes what a death left");
     }
 }

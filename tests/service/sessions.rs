@@ -252,6 +252,32 @@ fn solving_and_dropping_need_no_rig() {
 }
 
 #[test]
+fn limits_that_bar_everything_or_nothing_are_refused() {
+    let daemon = Daemon::on(Rig::small()).started();
+    let wrong = [
+        json!({ "min_views": 10_000_000_000_000_000_000_u64 }),
+        json!({ "min_views": 101 }),
+        json!({ "min_corners": 0 }),
+        json!({ "camera_rms_px": -1.0 }),
+        json!({ "quarters": 5 }),
+    ];
+    for gates in wrong {
+        let answer = daemon.post("/v1/calibrations/rig", &json!({ "board": board(), "gates": gates }));
+        let name = gates.as_object().and_then(|gates| gates.keys().next()).expect("a limit");
+        assert!(
+            answer.expect(422).json()["detail"].as_str().is_some_and(|why| why.contains(name)),
+            "{gates}"
+        );
+    }
+    let huge = json!({ "pattern": { "charuco": { "columns": 4_000_000_000_u32, "rows": 7, "square_mm": 12.0,
+        "marker_mm": 9.0, "dictionary": "4x4" } } });
+    daemon.post("/v1/calibrations/rig", &json!({ "board": huge })).expect(422);
+    assert_eq!(daemon.get("/v1/calibrations").json()["runs"], json!([]));
+    let folder = daemon.rig.path("store/.calibrations");
+    assert!(!folder.exists() || std::fs::read_dir(folder).expect("a folder").next().is_none());
+}
+
+#[test]
 fn a_view_that_cannot_be_read_is_named_and_can_be_dropped() {
     let daemon = Daemon::on(Rig::small()).started();
     daemon.ready();

@@ -257,13 +257,11 @@ impl Pattern {
                 length("pattern.diameter_mm", board.diameter_mm, 0.9 * apart);
             }
         }
-        if let Self::Charuco(board) = self
-            && board.columns * board.rows / 2 > 1000
-        {
-            faults.push(format!(
-                "pattern has {} light squares, a dictionary only 1000 markers",
-                board.columns * board.rows / 2
-            ));
+        if let Self::Charuco(board) = self {
+            let light = board.columns.saturating_mul(board.rows) / 2;
+            if light > 1000 {
+                faults.push(format!("pattern has {light} light squares, a dictionary only 1000 markers"));
+            }
         }
     }
 }

@@ -77,6 +77,9 @@ impl Setup {
     }
 }
 
+/// Limits that nothing can reach are written so.
+const MOST_OF_A_LIMIT: f64 = 1e6;
+
 /// Limits that a calibration must keep to be accepted.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -113,6 +116,43 @@ pub struct Gates {
     pub principal_share: f64,
     /// Largest deviation of the baseline from the one that is known, as a share of it.
     pub baseline_share: f64,
+}
+
+impl Gates {
+    /// What makes them no limits: values that no calibration could keep, or that would bar nothing. `most_views`: views
+    /// that can be taken.
+    pub fn faults(&self, most_views: usize) -> Vec<String> {
+        let counts = [
+            ("min_views", self.min_views, 1..=most_views),
+            ("min_corners", self.min_corners, 4..=10_000),
+            ("quarters", self.quarters, 0..=4),
+        ];
+        let counts = counts.into_iter().filter(|(_, value, range)| !range.contains(value)).map(
+            |(name, value, range)| {
+                format!("{name} is {value}, expected {} to {}", range.start(), range.end())
+            },
+        );
+        let limits = [
+            ("camera_rms_px", self.camera_rms_px),
+            ("projector_rms_px", self.projector_rms_px),
+            ("held_out_px", self.held_out_px),
+            ("outlier_ratio", self.outlier_ratio),
+            ("outlier_share", self.outlier_share),
+            ("bow_share", self.bow_share),
+            ("tilt_range_deg", self.tilt_range_deg),
+            ("parallel_deg", self.parallel_deg),
+            ("lit_share", self.lit_share),
+            ("focal_sigma_share", self.focal_sigma_share),
+            ("aspect_share", self.aspect_share),
+            ("principal_share", self.principal_share),
+            ("baseline_share", self.baseline_share),
+        ];
+        let limits = limits
+            .into_iter()
+            .filter(|(_, value)| !(0.0..=MOST_OF_A_LIMIT).contains(value))
+            .map(|(name, value)| format!("{name} is {value}, expected 0 to {MOST_OF_A_LIMIT}"));
+        counts.chain(limits).collect()
+    }
 }
 
 impl Default for Gates {

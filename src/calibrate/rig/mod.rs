@@ -10,6 +10,6 @@ mod views;
 
 pub use session::Session;
 pub use solve::{Subject, setup, solve};
-pub use steps::{Cells, SessionState, SessionView, Step, Task, compute, run};
+pub use steps::{Cells, MOST_VIEWS, SessionState, SessionView, Step, Task, compute, run};
 pub use take::{Shot, take};
 pub use views::{Views, name_of, number_of, read_picture};

@@ -27,7 +27,7 @@ use crate::{
 };
 
 /// Most views of a session.
-const MOST_VIEWS: usize = 100;
+pub const MOST_VIEWS: usize = 100;
 
 /// What is to be done in a session.
 #[derive(Debug, Clone, PartialEq, Eq)]

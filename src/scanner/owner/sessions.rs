@@ -139,7 +139,8 @@ impl Owner {
         if !record.state.is_terminal() {
             return Err(Denied::CalibrationEnded(record.state));
         }
-        self.library.calibrations().remove(id).map_err(|error| Denied::Storage(chain(&error)))?;
+        let left = self.library.calibrations().discard(id).map_err(|error| Denied::Storage(chain(&error)))?;
+        left.into_iter().for_each(|left| drop(self.out.disk.send(disk::Task::Remove(left))));
         Arc::make_mut(&mut self.calibrations).remove(id);
         self.event("calibration-deleted", |_| serde_json::json!({ "id": id }).to_string());
         self.look_at_storage();
