@@ -112,6 +112,29 @@ def test_a_cancelled_scan_is_cancelled_for_who_waits(bench: Scanner) -> None:
         scan.cloud()
 
 
+def test_the_report_of_a_scan_that_was_given_up_is_typed(bench: Scanner) -> None:
+    scan = bench.scan(mode="pse")
+    while not (progress := scan.refresh().progress) or progress.frames < 2:
+        time.sleep(0.02)
+    scan.cancel()
+    scan.done(30, check=False)
+    report = scan.report()
+    assert (report.verdict, report.reasons[0].type) == ("failed", "cancelled")
+    assert (report.pixels, report.points) == (None, None)
+    assert scan.frames().shape[0] == report.frames >= 2
+
+
+def test_previews_end_with_their_connection(service: Service, scanner: Scanner) -> None:
+    with Scanner("http://127.0.0.1:1") as nobody, pytest.raises(polscan.ConnectionLost):
+        next(nobody.previews())
+    scanner.wait_ready(30)
+    with Proxy(service.address, b"preview.mjpeg", []) as proxy, Scanner(proxy.url) as torn:
+        pictures = torn.previews()
+        assert next(pictures).jpeg[:2] == b"\xff\xd8"
+        proxy.cut_all()
+        assert len(list(pictures)) < 100
+
+
 def test_a_file_that_does_not_exist_yet_is_refused(bench: Scanner, tmp_path: Path) -> None:
     scan = bench.scan(mode="fast")
     with pytest.raises(polscan.Conflict):

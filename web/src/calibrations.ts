@@ -1,6 +1,6 @@
 /** Calibrations that the service runs, with what they say while they do. */
 
-import { get, local, post, type Run } from "./api";
+import { Problem, get, local, post, type Run } from "./api";
 import { badge, field, guarded, h, moment, say } from "./dom";
 import { current, listen } from "./events";
 import { sessionForm, sessionPanel } from "./session";
@@ -49,7 +49,8 @@ function entry(run: Run, refresh: () => Promise<void>): HTMLElement {
     run.summary.length && !(going && session) ? h("ul", {}, ...run.summary.map((line) => h("li", {}, sentences(line)))) : null,
     going ? null : session,
     files.length ? h("p", { class: "row" }, ...files) : null,
-    run.state === "running"
+    // A session is closed by its own button alone: to stop one view must not cost those before it.
+    run.state === "running" && !run.session
       ? h("button", { type: "button", onclick: guarded(() => post(`${run.href}/cancel`)) }, run.watch ? "Enough" : "Cancel")
       : null,
   );
@@ -70,11 +71,14 @@ export function calibrations(main: HTMLElement): () => void {
   const measured = () => (angle.value ? { angle_deg: Number(angle.value) } : {});
 
   function draw(): void {
-    const focused = document.activeElement?.closest("[data-run]")?.getAttribute("data-run");
+    const active = document.activeElement;
+    const focused = active?.closest("[data-run]")?.getAttribute("data-run");
     const newest = [...runs.values()].sort((one, other) => (one.id < other.id ? 1 : -1));
     list.replaceChildren(...newest.map((run) => entry(run, () => refresh(run))));
     if (runs.size === 0) list.append(h("p", { class: "none" }, "Nothing was calibrated by this service yet."));
-    if (focused) list.querySelector<HTMLElement>(`[data-run="${focused}"] button`)?.focus();
+    // The same button of the same run, or none: Enter must not do what another one does.
+    const buttons = focused ? list.querySelectorAll<HTMLElement>(`[data-run="${focused}"] button`) : [];
+    [...buttons].find((button) => button.textContent === active?.textContent)?.focus();
   }
   async function refresh(run: Run): Promise<void> {
     const found = (await get<Answer>("/v1/calibrations")).runs.find((one) => one.id === run.id);
@@ -97,7 +101,13 @@ export function calibrations(main: HTMLElement): () => void {
       const known = runs.get(data.id);
       if (known && data.live) take({ ...known, live: data.live });
     } else if (kind === "calibration" && data.id) {
-      current<Run>(`/v1/calibrations/${data.id}`).then(take).catch(say);
+      current<Run>(`/v1/calibrations/${data.id}`).then(take).catch((error) => {
+        // It may have been deleted since; the event of that is on its way.
+        if (!(error instanceof Problem && error.status === 404)) say(error);
+      });
+    } else if (kind === "calibration-deleted" && data.id) {
+      runs.delete(data.id);
+      draw();
     } else if (kind === "gap") {
       load().catch(say);
     }

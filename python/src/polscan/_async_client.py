@@ -252,13 +252,18 @@ class AsyncScanner:
 
     async def previews(self) -> AsyncGenerator[Preview, None]:
         """The latest frames one after the other; who is slow misses some. Ends where the connection does."""
-        async with self._client.stream("GET", "/v1/preview.mjpeg") as answer:
-            if answer.status_code != 200:
-                raise problem(answer.status_code, await answer.aread())
-            parser = PartParser()
-            async for chunk in answer.aiter_bytes():
-                for headers, jpeg in parser.feed(chunk):
-                    yield Preview.of(jpeg, headers)
+        begun = False
+        try:
+            async with self._client.stream("GET", "/v1/preview.mjpeg") as answer:
+                if answer.status_code != 200:
+                    raise problem(answer.status_code, await answer.aread())
+                begun, parser = True, PartParser()
+                async for chunk in answer.aiter_bytes():
+                    for headers, jpeg in parser.feed(chunk):
+                        yield Preview.of(jpeg, headers)
+        except httpx.TransportError as error:
+            if not begun:
+                raise self._lost(error) from error
 
     async def events(
         self, *, after: int | None = None, timeout_s: float | None = None
@@ -724,8 +729,11 @@ class AsyncCalibration:
         return info.session.views[-1]
 
     async def drop_view(self, name: str, timeout_s: float | None = None) -> CalibrationInfo:
-        """Drops a view with its frames."""
-        return await self._step("DELETE", f"views/{_requests.segment(name)}", timeout_s)
+        """Drops a view with its frames. `CalibrationFailed` says why the others cannot be looked at; the session stays open."""
+        info = await self._step("DELETE", f"views/{_requests.segment(name)}", timeout_s)
+        if info.error is not None:
+            raise CalibrationFailed(info)
+        return info
 
     async def solve(self, timeout_s: float | None = None, *, check: bool = True) -> CalibrationInfo:
         """Calibrates from the views. `CalibrationFailed` where it is refused, unless `check` is false; the session stays open.

@@ -42,8 +42,8 @@ class Report(Document):
     """`ok`, `degraded` or `failed`."""
     reasons: tuple[Cause, ...]
     """Empty if and only if the verdict is `ok`."""
-    pixels: dict[str, Any]
-    """Counts of pixels by class."""
+    pixels: dict[str, Any] | None = None
+    """Counts of pixels by class; `None` where nothing was decoded."""
     notes: tuple[str, ...] = ()
     points: int | None = None
     capture: dict[str, Any] | None = None

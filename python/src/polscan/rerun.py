@@ -13,15 +13,16 @@ from __future__ import annotations
 import argparse
 import sys
 import tomllib
-from collections.abc import Callable, Iterator
-from itertools import islice
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
+from itertools import islice, takewhile
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ._client import Scan, Scanner
-from .errors import PolscanError
+from .errors import NotFound, PolscanError
 from .models import ScanInfo
 
 try:
@@ -96,19 +97,33 @@ def _log_axes(scan: Scan, to: rr.RecordingStream) -> None:
 
 
 def _ended(scanner: Scanner, last: int) -> Iterator[Scan]:
-    """The `last` scans that have ended, the oldest first, and then each that ends, once."""
+    """The `last` scans that have ended, the oldest first, and then each that ends, once. Who is deleted first is left out."""
     after = scanner.status().revision
-    known: set[str] = set()
-    before = (scan for scan in scanner.scans() if scan.info.ended)
-    for scan in reversed(list(islice(before, last))):
-        known.add(scan.id)
-        # A list says nothing of files.
-        yield scanner.get(scan.id)
+    # Identities grow: scans that end from now on are not older than these.
+    begun = [scan.id for scan in scanner.scans(state=("queued", "projecting", "acquired", "decoding"))]
+    before = [scan.id for scan in islice((scan for scan in scanner.scans() if scan.info.ended), max(last, 1))]
+    since = min(begun + before[:1], default="")
+    # What is told of a scan after its end is a new label, or that it is kept.
+    known = set(before)
+    yield from _whole(scanner, reversed(before[:last]))
     for event in scanner.events(after=after):
-        # What is told of a scan after its end is a new label, or that it is kept.
-        if event.scan and event.scan.ended and event.scan.id not in known:
-            known.add(event.scan.id)
-            yield scanner.get(event.scan.id)
+        if event.kind == "gap":
+            # What happened meanwhile is forgotten, the scans are not.
+            newer = takewhile(lambda scan: scan.id >= since, scanner.scans())
+            ended = [scan.id for scan in newer if scan.info.ended and scan.id not in known]
+        elif event.scan and event.scan.ended and event.scan.id not in known:
+            ended = [event.scan.id]
+        else:
+            continue
+        known.update(ended)
+        yield from _whole(scanner, reversed(ended))
+
+
+def _whole(scanner: Scanner, ids: Iterable[str]) -> Iterator[Scan]:
+    """The scans with what is known of their files, of which lists and events say nothing."""
+    for id_ in ids:
+        with suppress(NotFound):
+            yield scanner.get(id_)
 
 
 def _arguments(arguments: list[str] | None) -> argparse.Namespace:

@@ -11,7 +11,7 @@ const SHOTS = resolve(import.meta.dirname, "../../../target/page/screenshots");
 /** The page as built last, where somebody works on it and does not want to build the program each time. */
 async function fromDisk(page: Page): Promise<void> {
   const folder = resolve(import.meta.dirname, "../../dist");
-  await page.route(/:\d+\/(assets\/(page|cloud)\.\w+)?$/, async (route) => {
+  await page.context().route(/:\d+\/(assets\/(page|cloud)\.\w+)?$/, async (route) => {
     const response = await route.fetch();
     const path = new URL(route.request().url()).pathname;
     const { "content-encoding": _, "content-length": __, ...headers } = response.headers();

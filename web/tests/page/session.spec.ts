@@ -55,6 +55,35 @@ test("the rig is calibrated with a board: guidance, refusal, a dropped view, a r
   await shot(page, "session-accepted", true);
 });
 
+test("a step of a session costs nothing that was taken before, in any tab", async ({ page, daemon, context }) => {
+  await page.goto(`${daemon.url}/#/calibrations`);
+  await expect(page.locator("#state")).toHaveText("ready to scan");
+  await page.getByRole("button", { name: "Rig, with a board" }).click();
+  const run = page.locator("[data-run]");
+  const views = run.locator("[data-view]");
+  const other = await context.newPage();
+  await other.goto(`${daemon.url}/#/calibrations`);
+  await expect(other.locator("[data-run]")).toHaveCount(1);
+
+  await run.getByRole("button", { name: "Take a view" }).click();
+  await expect(run.locator(".badge")).toHaveText(/running/);
+  await expect(run.getByRole("button", { name: "Cancel" })).toHaveCount(0);
+  await expect(views).toHaveCount(1, { timeout: 30_000 });
+  await expect(run.locator(".badge")).toHaveText("open");
+
+  // What others do meanwhile must not put another button under Enter.
+  await run.getByRole("button", { name: "Drop view-01" }).focus();
+  await other.getByRole("button", { name: "Take a view" }).click();
+  await expect(views).toHaveCount(2, { timeout: 30_000 });
+  expect(await page.evaluate(() => document.activeElement?.textContent)).not.toBe("Take a view");
+
+  await run.getByRole("button", { name: "Give up and delete" }).click();
+  await expect(run).toHaveCount(0);
+  await expect(other.locator("[data-run]")).toHaveCount(0);
+  await expect(page.locator("#problem")).toBeHidden();
+  await expect(other.locator("#problem")).toBeHidden();
+});
+
 test("a session can be given up", async ({ page, daemon }) => {
   await page.goto(`${daemon.url}/#/calibrations`);
   await expect(page.locator("#state")).toHaveText("ready to scan");
