@@ -1,9 +1,12 @@
 //! Where stripe edges cross a line of the image.
 
+mod slopes;
+
 use std::ops::Range;
 
 use polscan_patterns::Mode;
 
+use self::slopes::{Slope, Slopes};
 use crate::decode::{
     limits::Gates,
     plan::{BitFrames, Frames, PrefixCode},
@@ -81,6 +84,8 @@ pub(super) struct Walk {
     /// In order.
     pub runs: Vec<Run>,
     pub edges: Vec<Edge>,
+    /// Of the edges of the run that is under way.
+    slopes: Slopes,
     /// Last valid pixel and its value.
     last: Option<(usize, i32)>,
     first_pixel: usize,
@@ -93,6 +98,7 @@ impl Walk {
         self.classes.clear();
         self.runs.clear();
         self.edges.clear();
+        self.slopes.clear();
         (self.last, self.first_pixel, self.first_edge) = (None, 0, 0);
         let (values, classes) = (&finder.values[line.start..], &finder.maps.class[line.start..]);
         let known = |value: i32, class: Class| if class.is_valid() { value } else { -1 };
@@ -118,11 +124,11 @@ impl Walk {
                     && value.abs_diff(previous) as usize <= finder.step as usize * (position - before) =>
             {
                 if position == before + 1 && value != previous {
-                    finder.push_crossings(line, before, (previous, value), &mut self.edges);
+                    finder.push_crossings(line, before, (previous, value), self);
                 }
             }
             Some((before, _)) => {
-                self.close_run(before);
+                self.close_run(finder, before);
                 (self.first_pixel, self.first_edge) = (position, self.edges.len());
             }
             None => self.first_pixel = position,
@@ -130,15 +136,16 @@ impl Walk {
         self.last = Some((position, value));
     }
 
-    fn close_run(&mut self, last_pixel: usize) {
+    fn close_run<T: Sample>(&mut self, finder: &EdgeFinder<'_, T>, last_pixel: usize) {
+        self.slopes.weigh(&mut self.edges[self.first_edge..], finder.code.boundary(0), finder.floor);
         join(&mut self.edges, self.first_edge);
         self.runs
             .push(Run { pixels: self.first_pixel..last_pixel + 1, edges: self.first_edge..self.edges.len() });
     }
 
-    fn end(&mut self) {
+    fn end<T: Sample>(&mut self, finder: &EdgeFinder<'_, T>) {
         if let Some((before, _)) = self.last {
-            self.close_run(before);
+            self.close_run(finder, before);
         }
     }
 }
@@ -283,12 +290,12 @@ impl<'a, T: Sample> EdgeFinder<'a, T> {
                 walk.step(self, *line, position);
             }
         }
-        walks.iter_mut().for_each(Walk::end);
+        walks.iter_mut().for_each(|walk| walk.end(self));
     }
 
     /// Edges between two neighbouring pixels whose values differ.
-    fn push_crossings(&self, line: Line, position: usize, (from, to): (i32, i32), edges: &mut Vec<Edge>) {
-        let first = edges.len();
+    fn push_crossings(&self, line: Line, position: usize, (from, to): (i32, i32), walk: &mut Walk) {
+        let first = walk.edges.len();
         for value in from.min(to)..from.max(to) {
             let bit = self.code.bit_of_boundary(value);
             let (at, next) = (line.at(position), line.at(position + 1));
@@ -297,18 +304,21 @@ impl<'a, T: Sample> EdgeFinder<'a, T> {
             if a.0 * b.0 > 0.0 || a.0 == b.0 {
                 continue;
             }
-            let two_point = two_point(position, a, b);
-            let (place, variance) = match self.form {
-                EdgeForm::TwoPoint => two_point,
-                EdgeForm::PartialArea => self.partial_area(line, position, value, bit).unwrap_or(two_point),
-                EdgeForm::ThreeLines => {
-                    self.three_lines(line, position, two_point.0, (value, bit)).unwrap_or(two_point)
-                }
+            let (two_point, slope) = two_point(position, a, b);
+            let other_form = match self.form {
+                EdgeForm::TwoPoint => None,
+                EdgeForm::PartialArea => self.partial_area(line, position, value, bit),
+                EdgeForm::ThreeLines => self.three_lines(line, position, two_point, (value, bit)),
             };
+            let (place, variance) = other_form.unwrap_or((two_point, slope.of_position));
+            // The variance of the other forms does not follow from the slope between two pixels.
+            let slope = if other_form.is_some() { Slope { value: 0.0, ..slope } } else { slope };
             let u = self.code.boundary(value);
-            edges.push(Edge { position: place, weight: 1.0 / (variance + self.floor), u, rising: to > from });
+            let edge = Edge { position: place, weight: 1.0 / (variance + self.floor), u, rising: to > from };
+            let at = first + walk.edges[first..].partition_point(|edge| edge.position <= place);
+            walk.edges.insert(at, edge);
+            walk.slopes.measured.insert(at - walk.first_edge, slope);
         }
-        edges[first..].sort_by(|a, b| a.position.total_cmp(&b.position));
     }
 
     /// Partial-area form over the pixels around a crossing that belong to this edge alone: up to the middle of the
@@ -345,11 +355,12 @@ impl<'a, T: Sample> EdgeFinder<'a, T> {
 /// Crossing between two pixels: straight line through the two fringes, each stretched as the profile of a blurred
 /// edge asks for. An isolated edge of height +-1 is `a = 2 Phi(t) - 1`; `t(a)` makes it straight, and the width of the
 /// blur cancels. Where neighbouring stripes weaken the fringe, `a` is small and `t` as good as linear.
-fn two_point(position: usize, (a, of_a): (f64, f64), (b, of_b): (f64, f64)) -> (f64, f64) {
+fn two_point(position: usize, (a, of_a): (f64, f64), (b, of_b): (f64, f64)) -> (f64, Slope) {
     let ((a, per_a), (b, per_b)) = (straightened(a), straightened(b));
     let slope = a - b;
-    let variance = (b * b * of_a * per_a * per_a + a * a * of_b * per_b * per_b) / slope.powi(4);
-    (position as f64 + a / slope, variance)
+    let (of_a, of_b) = (of_a * per_a * per_a, of_b * per_b * per_b);
+    let of_position = (b * b * of_a + a * a * of_b) / slope.powi(4);
+    (position as f64 + a / slope, Slope { value: slope.abs(), variance: of_a + of_b, of_position })
 }
 
 /// Quantile of the normal distribution at `(1 + a) / 2` up to a constant factor, and its derivative: its series to
