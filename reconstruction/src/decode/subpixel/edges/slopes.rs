@@ -141,8 +141,9 @@ mod tests {
         let [own, neighbours] = trial(0.0872);
         assert!(neighbours[0] < 0.85 * own[0], "{own:?} {neighbours:?}");
         let claims = |sums: [f64; 2]| (sums[0] / sums[1]).sqrt();
-        assert!(claims(own) > 1.15, "{own:?}");
-        assert!((0.9..1.1).contains(&claims(neighbours)), "{neighbours:?}");
+        // What is left comes of crossings that noise has moved to the next pair of pixels.
+        assert!((1.0..1.2).contains(&claims(neighbours)), "{neighbours:?}");
+        assert!(claims(own) > claims(neighbours) + 0.1, "{own:?} {neighbours:?}");
     }
 
     #[test]
