@@ -2,13 +2,14 @@
 //! both come through here, which is why they agree bit for bit.
 
 mod ahead;
+mod background;
 
 use std::time::Instant;
 
 use polscan_patterns::Role;
 use thiserror::Error;
 
-pub use self::ahead::Ahead;
+pub use self::{ahead::Ahead, background::background_pool};
 use crate::{
     cloud::{ReconstructError, ReconstructSettings, Reconstruction, reconstruct, reconstruct_with},
     decode::{self, Accumulator, DecodeError, DecodeSettings, Decoded, SharedPlane},

@@ -2,6 +2,7 @@
 
 use std::sync::{Arc, OnceLock};
 
+use super::background_pool;
 use crate::geometry::{Calibration, Triangulator};
 
 /// A triangulator, made once for a scan.
@@ -9,16 +10,15 @@ use crate::geometry::{Calibration, Triangulator};
 pub struct Ahead(Arc<OnceLock<Option<Triangulator>>>);
 
 impl Ahead {
-    /// Begins to make it on a thread of its own, where there is a calibration. Without such a thread it is made when it is
-    /// asked for.
+    /// Begins to make it on one thread, where there is a calibration: the other cores, and the first turn on this one, are
+    /// for whoever shows the patterns meanwhile. Without such a thread it is made when it is asked for.
     pub fn begin(&self, calibration: Option<&Calibration>) {
-        let Some(calibration) = calibration.cloned() else { return };
+        let (Some(calibration), Ok(pool)) = (calibration.cloned(), background_pool(Some(1))) else { return };
         let ahead = self.clone();
-        let work = move || {
+        // The result waits in the cell; nobody waits for the thread, which ends when it is done.
+        pool.spawn(move || {
             ahead.triangulator(Some(&calibration));
-        };
-        // The result waits in the cell; nobody waits for the thread.
-        let _ = std::thread::Builder::new().name("prepare".to_owned()).spawn(work);
+        });
     }
 
     /// The triangulator of `calibration`; `None` where it can triangulate nothing, which the reconstruction explains.

@@ -20,9 +20,6 @@ use crate::{
     sequencer::CancelFlag,
 };
 
-/// How much the computing threads stand back behind all others.
-const NICE: i32 = 5;
-
 /// What is to be finished.
 #[derive(Debug)]
 pub enum Work {
@@ -93,19 +90,6 @@ impl From<Failure> for Broken {
     fn from(failure: Failure) -> Self {
         Self { kind: failure.kind().slug(), message: failure.chain() }
     }
-}
-
-/// The threads that compute.
-pub fn pool() -> Result<rayon::ThreadPool, rayon::ThreadPoolBuildError> {
-    rayon::ThreadPoolBuilder::new()
-        .thread_name(|number| format!("compute-{number}"))
-        .start_handler(|_| {
-            // On Linux this is about the calling thread alone.
-            if let Err(error) = rustix::process::nice(NICE) {
-                tracing::debug!(%error, "computing threads run at the priority of all others");
-            }
-        })
-        .build()
 }
 
 /// Finishes captures until all senders of `work` are gone.

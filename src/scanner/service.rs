@@ -23,6 +23,7 @@ use crate::{
     calibrate::rig::Step,
     config::Settings,
     engine::Shown,
+    pipeline::background_pool,
     store::{Index, Library},
 };
 
@@ -76,7 +77,7 @@ pub fn start(settings: Settings, library: Library, index: Index) -> std::io::Res
         metrics: Arc::new(Metrics::default()),
         heartbeats: [Arc::new(Heartbeat::default()), Arc::new(Heartbeat::default())],
     };
-    let pool = Arc::new(finish::pool().map_err(std::io::Error::other)?);
+    let pool = Arc::new(background_pool(None).map_err(std::io::Error::other)?);
     let shared = rig::Shared {
         settings: settings.clone(),
         news: messages.clone(),
